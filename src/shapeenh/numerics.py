@@ -1,0 +1,120 @@
+"""Gradient-safe primitives. Each says its value and its gradient at the bad point, and why plain code will not do.
+
+Symmetric 2x2 tensors are `[..., 3]` arrays (xx, xy, yy). Imports nothing of ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+# ------------------------------------------------------------------------------------------- roots and quotients
+
+
+def safe_divide(a, b):
+    """a / b, and 0 with zero gradients where b == 0 (plain division gives inf or NaN there, and 0 * inf in reverse)."""
+    zero = b == 0
+    return jnp.where(zero, 0, a / jnp.where(zero, 1, b))
+
+
+def safe_sqrt(x):
+    """sqrt(x), and 0 with gradient 0 where x <= 0 (the true derivative is infinite there and poisons chained zeros)."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+
+
+def safe_power(x, exponent):
+    """x ** exponent for x >= 0; 0 with zero gradients where x <= 0, for every exponent, zero included.
+
+    As a reflectance lobe, light from behind the surface stays dark even with exponent 0. Plain `x ** p` has
+    d/dx = inf at 0 for p < 1 and d/dp = 0 * log 0 = NaN.
+    """
+    positive = x > 0
+    return jnp.where(positive, jnp.exp(exponent * jnp.log(jnp.where(positive, x, 1))), 0)
+
+
+@jax.custom_jvp
+def safe_hypot(x, y):
+    """sqrt(x^2 + y^2) without overflow or underflow; 0 with gradient 0 at the origin (plain hypot gives NaN there).
+
+    For a function that is even in the radius, such as any spectral function of a 2x2 tensor at an umbilic, the zero is
+    the exact derivative, not a convention.
+    """
+    ax, ay = jnp.abs(x), jnp.abs(y)
+    big, small = jnp.maximum(ax, ay), jnp.minimum(ax, ay)
+    ratio = small / jnp.where(big == 0, 1, big)
+    return big * jnp.sqrt(1 + ratio * ratio)
+
+
+@safe_hypot.defjvp
+def _safe_hypot_jvp(primals, tangents):
+    (x, y), (dx, dy) = primals, tangents
+    r = safe_hypot(x, y)
+    s = jnp.where(r == 0, 1, r)
+    return r, (x / s) * dx + (y / s) * dy
+
+
+def norm(v, axis: int = -1, keepdims: bool = False):
+    """Euclidean length, scaled against overflow; 0 with gradient 0 for the zero vector (plain norm gives NaN)."""
+    big = jax.lax.stop_gradient(jnp.max(jnp.abs(v), axis=axis, keepdims=True))
+    big = jnp.where(big > 0, big, 1)
+    u = v / big
+    length = safe_sqrt(jnp.sum(u * u, axis=axis, keepdims=True)) * big
+    return length if keepdims else jnp.squeeze(length, axis)
+
+
+def normalize(v, axis: int = -1):
+    """v / |v|; the zero vector stays zero, with zero gradients (plain division gives NaN)."""
+    return safe_divide(v, norm(v, axis, keepdims=True))
+
+
+# ------------------------------------------------------------------------------------------- symmetric 2x2 tensors
+
+
+def eigenvalues(tensor):
+    """(k1, k2), k1 >= k2, of `[..., 3]` tensors: Hm ± r (SPEC 3.8).
+
+    Gradient: exact off umbilics; at an umbilic the derivative of r is taken as 0, so that every symmetric function of
+    (k1, k2) has its exact gradient there.
+    """
+    xx, xy, yy = tensor[..., 0], tensor[..., 1], tensor[..., 2]
+    mean = 0.5 * xx + 0.5 * yy
+    r = safe_hypot(0.5 * xx - 0.5 * yy, xy)
+    return mean + r, mean - r
+
+
+def matrix_function(tensor, f: Callable, divided_difference: Callable):
+    """F(H) = mean(f(k1), f(k2)) I + f[k1, k2] (H - Hm I), without eigenvectors (SPEC 3).
+
+    `divided_difference(k1, k2)` is (f(k1) - f(k2)) / (k1 - k2), with its limit f'(k) at k1 = k2; written out by the
+    caller in a form that does not cancel. Smooth at umbilics, and so are its gradients; eigenvectors are not.
+    """
+    xx, xy, yy = tensor[..., 0], tensor[..., 1], tensor[..., 2]
+    k1, k2 = eigenvalues(tensor)
+    mean = 0.5 * f(k1) + 0.5 * f(k2)
+    slope = divided_difference(k1, k2)
+    deviation = slope * (0.5 * xx - 0.5 * yy)
+    return jnp.stack([mean + deviation, slope * xy, mean - deviation], axis=-1)
+
+
+def determinant(tensor):
+    """xx yy - xy^2 of `[..., 3]` tensors; entries are clamped so that the products stay finite (gradient 0 beyond)."""
+    bound = 0.5 * jnp.sqrt(jnp.finfo(tensor.dtype).max)
+    t = jnp.clip(tensor, -bound, bound)
+    return t[..., 0] * t[..., 2] - t[..., 1] * t[..., 1]
+
+
+# ------------------------------------------------------------------------------------------- steps
+
+
+def smoothstep(low, high, x):
+    """Hermite step: 0 below `low`, 1 above `high`, 3t^2 - 2t^3 between; its gradient is 0 at both ends."""
+    t = jnp.clip((x - low) / (high - low), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def luminance(rgb):
+    """Rec. 709 luminance of linear RGB `[..., 3]`."""
+    return 0.2126 * rgb[..., 0] + 0.7152 * rgb[..., 1] + 0.0722 * rgb[..., 2]

@@ -1,0 +1,38 @@
+"""Strict JAX for every test: x64 is switched on per test by the `x64` fixture; rank promotion is an error."""
+
+import jax
+import numpy as np
+import pytest
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def pytest_addoption(parser):
+    parser.addoption("--slow", action="store_true", help="run the tests marked slow too")
+
+
+def pytest_collection_modifyitems(config, items):
+    if not config.getoption("--slow"):
+        skip = pytest.mark.skip(reason="slow; runs with --slow")
+        for item in items:
+            if "slow" in item.keywords:
+                item.add_marker(skip)
+
+
+@pytest.fixture(params=["float32", "float64"])
+def dtype(request):
+    """Both precisions; float64 under jax_enable_x64."""
+    with jax.enable_x64(request.param == "float64"):
+        yield np.dtype(request.param)
+
+
+@pytest.fixture
+def x64():
+    """float64, the reference precision."""
+    with jax.enable_x64(True):
+        yield np.dtype(np.float64)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(20090803)
