@@ -13,7 +13,9 @@ def test_hypot_and_norm_survive_extreme_scales(dtype, rng):
     for scale in (1e-30, 1.0, 1e30):
         expected = np.linalg.norm(np.asarray(v, np.float64), axis=-1) * scale
         np.testing.assert_allclose(numerics.norm(v * scale), expected, rtol=1e-6)
-    np.testing.assert_allclose(numerics.safe_hypot(v[:, 0] * 1e30, v[:, 1] * 1e30) / 1e30, np.hypot(v[:, 0], v[:, 1]), rtol=1e-6)
+    np.testing.assert_allclose(
+        numerics.safe_hypot(v[:, 0] * 1e30, v[:, 1] * 1e30) / 1e30, np.hypot(v[:, 0], v[:, 1]), rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize(
@@ -51,7 +53,10 @@ def test_eigenvalues_are_ordered_and_symmetric_functions_of_them_have_exact_grad
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: checks.check_shape("normal", np.zeros((2, 3)), (None, None, 3)), r"normal has shape \(2, 3\).*any, any, 3"),
+        (
+            lambda: checks.check_shape("normal", np.zeros((2, 3)), (None, None, 3)),
+            r"normal has shape \(2, 3\).*any, any, 3",
+        ),
         (lambda: checks.check_finite("vertices", np.array([1.0, np.nan])), "vertices holds 1 NaN"),
         (lambda: checks.check_range("gamma", 2.0, -1, 1), r"gamma is 2.0.*\[-1, 1\]"),
         (lambda: checks.check_range("invariant", 0.0, 0, 1, open_ends=True), r"\]0, 1\["),
