@@ -17,9 +17,10 @@ def is_concrete(*trees) -> bool:
 
 
 def float_dtype(*arrays):
-    """float64 where x64 is enabled and one of the arrays is float64, else float32."""
-    wide = any(np.dtype(a.dtype) == np.float64 for a in arrays if hasattr(a, "dtype"))
-    return jnp.result_type(jnp.float64 if wide else jnp.float32)
+    """float64 where x64 is enabled and an array is float64, float32 for narrower floats, JAX's default without any."""
+    given = [np.dtype(a.dtype) for a in arrays if hasattr(a, "dtype")]
+    floats = [d for d in given if jnp.issubdtype(d, jnp.floating)]
+    return jnp.result_type(jnp.float64 if not floats or np.dtype(np.float64) in floats else jnp.float32)
 
 
 def check_shape(name: str, array, shape: tuple) -> None:

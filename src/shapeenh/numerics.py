@@ -118,3 +118,18 @@ def smoothstep(low, high, x):
 def luminance(rgb):
     """Rec. 709 luminance of linear RGB `[..., 3]`."""
     return 0.2126 * rgb[..., 0] + 0.7152 * rgb[..., 1] + 0.0722 * rgb[..., 2]
+
+
+# ------------------------------------------------------------------------------------------- colour
+
+
+def srgb_encode(linear):
+    """IEC 61966-2-1: linear [0, 1] to display values [0, 1]; clips outside. Gradient: finite everywhere (linear toe)."""
+    x = jnp.clip(linear, 0, 1)
+    return jnp.where(x <= 0.0031308, 12.92 * x, 1.055 * jnp.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def srgb_decode(display):
+    """The inverse of `srgb_encode`; clips to [0, 1]."""
+    x = jnp.clip(display, 0, 1)
+    return jnp.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
