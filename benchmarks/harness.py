@@ -1,0 +1,96 @@
+"""What every benchmark shares: interleaved timing with compile apart, a table, JSON with the machine, a data folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import statistics
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def measure(calls: dict, *, repeats: int = 9, seconds: float = 20.0) -> dict[str, dict[str, float]]:
+    """Time functions of no arguments in turns, so that a slow phase of the machine hits all of them alike.
+
+    Returns per name: `first_ms` (compile and run), `median_ms`, `min_ms`, `runs`.
+    """
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    first = {name: _milliseconds(call) for name, call in calls.items()}
+    start = time.perf_counter()
+    for _ in range(repeats):
+        for name, call in calls.items():
+            times[name].append(_milliseconds(call))
+        if time.perf_counter() - start > seconds:
+            break
+    return {
+        name: {
+            "first_ms": round(first[name], 3),
+            "median_ms": round(statistics.median(t), 3),
+            "min_ms": round(min(t), 3),
+            "runs": len(t),
+        }
+        for name, t in times.items()
+    }
+
+
+def _milliseconds(call) -> float:
+    start = time.perf_counter()
+    jax.block_until_ready(call())
+    return (time.perf_counter() - start) * 1e3
+
+
+def machine() -> dict:
+    """What the numbers were measured on."""
+    return {
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "processor": _processor(),
+        "system": platform.system(),
+        "device": jax.devices()[0].device_kind,
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "numpy": np.__version__,
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def table(rows: list[dict]) -> str:
+    """Rows of equal keys as an aligned text table."""
+    if not rows:
+        return "(nothing)"
+    keys = list(rows[0])
+    text = [[str(k) for k in keys]] + [[_text(row.get(k)) for k in keys] for row in rows]
+    widths = [max(len(line[i]) for line in text) for i in range(len(keys))]
+    align = lambda line: "  ".join(c.rjust(w) if i else c.ljust(w) for i, (c, w) in enumerate(zip(line, widths)))  # noqa: E731, B905
+    return "\n".join(align(line) for line in text)
+
+
+def _text(value) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
+
+
+def write(name: str, rows: list[dict], **more) -> Path:
+    """`results/NAME.json`: the machine, the rows, and whatever else there is to say."""
+    RESULTS.mkdir(exist_ok=True)
+    path = RESULTS / f"{name}.json"
+    path.write_text(json.dumps({"machine": machine(), **more, "rows": rows}, indent=1) + "\n")
+    return path
+
+
+def data(name: str) -> Path | None:
+    """A file of the folder SHAPEENH_DATA (meshes and maps that are not part of the repository), or None."""
+    folder = os.environ.get("SHAPEENH_DATA")
+    path = Path(folder) / name if folder else None
+    return path if path is not None and path.exists() else None
