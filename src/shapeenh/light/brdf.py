@@ -1,0 +1,74 @@
+"""Reflectance: isotropic Ashikhmin-Shirley (SPEC 7; TH10 3.2.2, corrected)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from shapeenh import checks, numerics
+
+DIFFUSE = 28 / (23 * np.pi)
+
+
+def _fifth(x):
+    """x^5 by three products."""
+    y = x * x
+    return y * y * x
+
+
+def diffuse_lobe(cos_light, cos_view):
+    """rho_d / (R_d (1 - R_s)): `28/(23 pi) (1 - (1 - n.l/2)^5)(1 - (1 - n.e/2)^5)`."""
+    return DIFFUSE * (1 - _fifth(1 - 0.5 * cos_light)) * (1 - _fifth(1 - 0.5 * cos_view))
+
+
+def specular_lobe(cos_half, half_view, cos_light, cos_view, shininess):
+    """rho_s / F: `(eta + 1)/(8 pi) (n.h)^eta / ((h.e) max(n.l, n.e))`; 0 where n.h or a denominator is not positive."""
+    peak = numerics.safe_power(cos_half, shininess) * (shininess + 1) / (8 * np.pi)
+    below = half_view * jnp.maximum(cos_light, cos_view)
+    return jnp.where(below > 0, peak / jnp.where(below > 0, below, 1), 0)
+
+
+def fresnel(specular, half_view):
+    """Schlick: `F = R_s + (1 - R_s)(1 - e.h)^5`."""
+    return specular + (1 - specular) * _fifth(1 - half_view)
+
+
+def _dot(a, b):
+    return jnp.sum(a * b, axis=-1, keepdims=True)
+
+
+def ashikhmin_shirley(normal, light, view, material):
+    """The isotropic Ashikhmin-Shirley BRDF, without the cosine.
+
+    Source: SPEC 7; Ashikhmin and Shirley 2000; TH10 3.2.2 with the norm (eta + 1)/(8 pi).
+    normal, light, view: [..., 3], unit, in one frame, pointing away from the surface; leading axes broadcast.
+    material: `Material`; its fields may be Python floats, or arrays that broadcast with [..., 3] (shininess: [...]).
+    Returns [..., 3], 1/sr, >= 0; 0 where the light or the viewer is behind the surface.
+    Gradient: exact in all arguments where n.l > 0 and n.e > 0, zero elsewhere; finite everywhere.
+    Errors: ValueError for a last axis other than 3, or concrete R_d, R_s outside [0, 1] or shininess < 0.
+    """
+    for name, array in (("normal", normal), ("light", light), ("view", view)):
+        checks.check_shape(name, array, (..., 3))
+    check_material(material)
+    dtype = checks.float_dtype(normal, light, view)
+    shape = np.broadcast_shapes(np.shape(normal), np.shape(light), np.shape(view))
+    n, l, e = (jnp.broadcast_to(jnp.asarray(a, dtype), shape) for a in (normal, light, view))
+    diffuse, specular = (jnp.broadcast_to(jnp.asarray(a, dtype), shape) for a in (material.diffuse, material.specular))
+    shininess = jnp.broadcast_to(jnp.asarray(material.shininess, dtype), shape[:-1])[..., None]
+
+    cos_light, cos_view = _dot(n, l), _dot(n, e)
+    lit = (cos_light > 0) & (cos_view > 0)
+    cos_light, cos_view = jnp.where(lit, cos_light, 1), jnp.where(lit, cos_view, 1)
+    half = numerics.normalize(l + e)
+    half_view = jnp.minimum(_dot(half, e), 1)
+    rho = diffuse * (1 - specular) * diffuse_lobe(cos_light, cos_view) + fresnel(specular, half_view) * specular_lobe(
+        jnp.minimum(_dot(n, half), 1), half_view, cos_light, cos_view, shininess
+    )
+    return jnp.where(lit, rho, 0)
+
+
+def check_material(material) -> None:
+    """Ranges of the fields of `Material`, looked at where concrete."""
+    checks.check_range("material.diffuse", material.diffuse, 0, 1)
+    checks.check_range("material.specular", material.specular, 0, 1)
+    checks.check_range("material.shininess", material.shininess, 0, np.inf)
