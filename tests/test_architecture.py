@@ -7,7 +7,7 @@ import pytest
 
 SOURCE = Path(__file__).parent.parent / "src" / "shapeenh"
 BASE = ("types", "numerics", "checks")
-STAGES = ("scene", "buffers", "descriptor", "light", "style", "lines", "fit")
+STAGES = ("codecs", "scene", "buffers", "descriptor", "light", "style", "lines", "fit")
 SEES_ALL = ("pipeline", "cli", "__init__")
 TOUCHES_FILES = ("io", "cli")
 KERNELS = {"light": ("brdf", "warp", "scaling")}  # siblings that never import one another

@@ -172,7 +172,7 @@ def _color(text: str) -> tuple[float, float, float]:
 def cmd_render(arguments) -> None:
     """Render a mesh and light-warp it: the original beside the enhanced picture."""
     _check_ranges(arguments)
-    _check_folder(Path(arguments.output).parent, "output folder")
+    io.check_picture_path(arguments.output)
     if arguments.buffers is not None:
         _check_folder(Path(arguments.buffers), "--buffers folder")
     if arguments.json not in (None, "-"):

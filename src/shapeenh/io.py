@@ -17,6 +17,7 @@ from shapeenh.scene.mesh import check_faces, make_mesh
 from shapeenh.types import Mesh
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff")
 FAR_FROM_ORIGIN = 1e3  # centre distance over extent from which float32 loses visible detail: the mesh is then recentred
 
 
@@ -33,8 +34,8 @@ def load_mesh(path, *, crease_degrees: float | None = None) -> Mesh:
 
     Args:
         path: the file.
-        crease_degrees: split the normals at edges sharper than this many degrees, ]0, 180[; None keeps all edges smooth.
-            Ignored where the file has normals.
+        crease_degrees: split the normals at edges sharper than this many degrees, ]0, 180[; None keeps all edges
+            smooth. Ignored where the file has normals.
 
     Returns: `Mesh`; `colors` in linear RGB where the file has vertex or face colours, `uv` where it has them.
     Errors: FileNotFoundError; ValueError for an unknown suffix, an unreadable file, or no face that can be drawn.
@@ -109,7 +110,7 @@ def _appearance(body):
 
 
 def _concatenate(parts):
-    """One set of arrays; a body without normals, colours or uv gets zeros (normals) or white, where another has them."""
+    """One set of arrays; where only some bodies have normals, colours or uv, the others get zero, white, zero."""
     offsets = np.cumsum([0] + [len(p[0]) for p in parts[:-1]])
     vertices = np.concatenate([p[0] for p in parts])
     faces = np.concatenate([p[1] + o for p, o in zip(parts, offsets, strict=True)])
@@ -229,7 +230,7 @@ def load_image(path, *, linear: bool = False) -> np.ndarray:
     data = path.read_bytes()
     suffix = path.suffix.lower()
     try:
-        image = codecs.decode_image(data, suffix, path=path)
+        image = codecs.decode_image(data, suffix)
     except (MemoryError, KeyboardInterrupt):
         raise
     except Exception as error:
@@ -254,10 +255,18 @@ def save_image(path, image, *, bits: int = 8) -> None:
 
     >>> se.save_image("out.png", se.render(mesh, camera, lights, material, height=600, width=800))
     """
+    path = check_picture_path(path)
+    path.write_bytes(codecs.encode_image(np.asarray(image), path.suffix.lower(), bits=bits))
+
+
+def check_picture_path(path) -> Path:
+    """A path that `save_image` can write to: a known suffix, an existing folder."""
     path = Path(path)
+    if path.suffix.lower() not in PICTURE_SUFFIXES:
+        raise ValueError(f"{path} has the suffix {path.suffix!r}; accepted are pictures {', '.join(PICTURE_SUFFIXES)}")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"the output folder {path.parent} does not exist")
-    path.write_bytes(codecs.encode_image(np.asarray(image), path.suffix.lower(), bits=bits))
+    return path
 
 
 def _existing(path) -> Path:

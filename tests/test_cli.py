@@ -1,0 +1,117 @@
+"""The command line, run as a user would: pictures, buffers, JSON, and one plain line for wrong input."""
+
+import json
+
+import numpy as np
+import pytest
+
+import shapeenh as se
+from shapeenh.cli import main
+
+SMALL = ["--size", "48x36", "--lights", "8"]
+
+
+@pytest.fixture(autouse=True)
+def no_compilation_cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+
+
+@pytest.fixture
+def mesh_file(tmp_path):
+    path = tmp_path / "torus.obj"
+    torus = se.torus(segments=12)
+    lines = [f"v {x} {y} {z}" for x, y, z in np.asarray(torus.vertices).tolist()]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in np.asarray(torus.faces).tolist()]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_render_writes_both_pictures_side_by_side(mesh_file, tmp_path, capsys):
+    assert main(["render", str(mesh_file), "-o", str(tmp_path / "out.png"), *SMALL]) == 0
+    image = se.load_image(tmp_path / "out.png")
+    assert image.shape == (36, 96, 3)
+    left, right = image[:, :48].astype(int), image[:, 48:].astype(int)
+    assert np.abs(left - right).max() > 5  # the warp shows
+    assert np.all(left[0, 0] == right[0, 0])  # and the background is the same
+    assert capsys.readouterr().err == ""  # not a terminal: silent
+
+
+def test_alpha_zero_shows_the_original_twice(mesh_file, tmp_path):
+    assert main(["render", str(mesh_file), "-o", str(tmp_path / "o.png"), "--alpha", "0", *SMALL]) == 0
+    image = se.load_image(tmp_path / "o.png").astype(int)
+    assert np.abs(image[:, :48] - image[:, 48:]).max() <= 1
+
+
+def test_only_buffers_and_json(mesh_file, tmp_path, capsys):
+    buffers = tmp_path / "buffers"
+    buffers.mkdir()
+    arguments = ["render", str(mesh_file), "-o", str(tmp_path / "o.png"), "--only", "--buffers", str(buffers), "--json"]
+    assert main([*arguments, *SMALL]) == 0
+    assert se.load_image(tmp_path / "o.png").shape == (36, 48, 3)
+    assert {p.name for p in buffers.iterdir()} == {
+        f"{n}.{s}" for n in ("normal", "depth", "curvature") for s in ("png", "tif")
+    }
+    depth = se.load_image(buffers / "depth.tif")
+    normal = se.load_image(buffers / "normal.tif")
+    assert depth.dtype == normal.dtype == np.float32
+    assert depth.shape == (36, 48)
+    np.testing.assert_allclose(np.linalg.norm(normal[depth > 0], axis=-1), 1, atol=1e-4)
+    record = json.loads(capsys.readouterr().out)
+    assert record["parameters"]["alpha"] == 40.0
+    assert record["triangles"] == 576
+    assert set(record["seconds"]["shade warped"]) == {"compile", "run"}
+
+
+def test_the_embedded_object_needs_no_file(tmp_path):
+    assert (
+        main(["render", "-o", str(tmp_path / "o.png"), "--only", "--env", "sky", "--material", "bronze", *SMALL]) == 0
+    )
+    assert se.load_image(tmp_path / "o.png").std() > 10
+
+
+def test_a_mesh_with_nan_goes_on_with_a_warning(tmp_path, capsys):
+    path = tmp_path / "nan.obj"
+    path.write_text("v 0 0 nan\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 2 3 4\n")
+    assert main(["render", str(path), "-o", str(tmp_path / "o.png"), *SMALL]) == 0
+    assert capsys.readouterr().err.count("shapeenh: warning: ") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["render"], "required: -o"),
+        (["render", "MISSING.obj", "-o", "OUT"], "MISSING.obj does not exist"),
+        (["render", "EMPTY.obj", "-o", "OUT"], "no triangles"),
+        (["render", "BROKEN.ply", "-o", "OUT"], "cannot be read as a PLY mesh"),
+        (["render", "-o", "NOWHERE/o.png"], "output folder"),
+        (["render", "-o", "o.xyz"], ".xyz"),
+        (["render", "-o", "OUT", "--buffers", "NOWHERE"], "--buffers folder"),
+        (["render", "-o", "OUT", "--json", "NOWHERE/a.json"], "--json folder"),
+        (["render", "-o", "OUT", "--alpha", "nan"], "not a finite number"),
+        (["render", "-o", "OUT", "--alpha", "much"], "--alpha"),
+        (["render", "-o", "OUT", "--gamma", "1.5"], "--gamma is 1.5; accepted are numbers from -1 to 1"),
+        (["render", "-o", "OUT", "--sigma", "-1"], "--sigma is -1"),
+        (["render", "-o", "OUT", "--size", "800"], "WIDTHxHEIGHT"),
+        (["render", "-o", "OUT", "--size", "0x10"], "outside 1x1"),
+        (["render", "-o", "OUT", "--fov", "180"], "--fov is 180"),
+        (["render", "-o", "OUT", "--view", "10"], "AZIMUTH,ELEVATION"),
+        (["render", "-o", "OUT", "--view", "0,90"], "elevation 90"),
+        (["render", "-o", "OUT", "--lights", "0"], "--lights is 0"),
+        (["render", "-o", "OUT", "--material", "cheese"], "'cheese' is neither one of plaster"),
+        (["render", "-o", "OUT", "--background", "#12"], "#RRGGBB"),
+        (["render", "-o", "OUT", "--env", "MISSING.exr"], "MISSING.exr does not exist"),
+        (["sculpt"], "invalid choice"),
+    ],
+)
+def test_wrong_input_is_one_plain_line_and_exit_code_2(arguments, words, tmp_path, capsys):
+    (tmp_path / "EMPTY.obj").write_text("# nothing\n")
+    (tmp_path / "BROKEN.ply").write_text("hello\n")
+    named = [str(tmp_path / a) if a.split("/")[0].split(".")[0].isupper() and a.isascii() else a for a in arguments]
+    named = [a + ".png" if a.endswith("OUT") else a for a in named]
+    named = [str(tmp_path / a) if a == "o.xyz" else a for a in named]
+    assert main(named) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1
+    assert captured.err.startswith("shapeenh: error: ")
+    assert words in captured.err
+    assert captured.out == ""

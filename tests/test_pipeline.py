@@ -1,0 +1,183 @@
+"""The whole chain: laws of the picture, gradients, recompilation."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import shapeenh as se
+from tests.reference.differences import assert_gradient
+
+SIZE = {"height": 48, "width": 64}
+
+
+def scene(dtype=np.float32, lights=12):
+    mesh = jax.tree.map(lambda a: a.astype(dtype) if a.dtype.kind == "f" else a, se.torus(segments=24))
+    camera = se.frame_mesh(mesh, direction=(0.2, 0.9, 0.7), aspect=4 / 3)
+    lamps = se.sample_environment(se.procedural_studio(), lights)
+    material = se.named_material("stone")
+    cast = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, dtype), tree)  # noqa: E731
+    return mesh, camera, cast(lamps), cast(material)
+
+
+def test_the_picture_has_light_where_the_mask_is_and_nowhere_else(dtype):
+    mesh, camera, lights, material = scene(dtype)
+    image = se.render(mesh, camera, lights, material, se.LightWarp(30.0), sigma=1.0, **SIZE)
+    mask = np.asarray(se.render_gbuffer(mesh, camera, **SIZE).mask)
+    assert image.shape == (48, 64, 3)
+    assert image.dtype == dtype
+    assert np.all(np.isfinite(image))
+    assert np.all(np.asarray(image)[~mask] == 0)
+    assert np.all(np.asarray(image)[mask].max(axis=-1) > 0)
+
+
+@pytest.mark.parametrize("enhancement", [se.LightWarp(0.0, 0.0), se.RadianceScaling(0.4, 0.0, 0.0)])
+def test_strength_zero_is_the_plain_picture(enhancement, dtype):
+    mesh, camera, lights, material = scene(dtype)
+    plain = se.render(mesh, camera, lights, material, **SIZE)
+    same = se.render(mesh, camera, lights, material, enhancement, sigma=1.0, **SIZE)
+    traced = jax.jit(lambda e: se.render(mesh, camera, lights, material, e, sigma=1.0, **SIZE))(enhancement)
+    tolerance = 1e-5 if dtype == np.float32 else 1e-12
+    np.testing.assert_allclose(same, plain, rtol=tolerance, atol=tolerance)
+    np.testing.assert_allclose(traced, plain, rtol=tolerance, atol=tolerance)
+
+
+def test_flat_places_do_not_change(x64):
+    mesh = jax.tree.map(lambda a: a.astype(np.float64) if a.dtype.kind == "f" else a, se.plane(segments=3))
+    camera = se.frame_mesh(mesh, direction=(0.4, 0.3, 1.0))
+    _, _, lights, material = scene(np.float64)
+    plain = se.render(mesh, camera, lights, material, **SIZE)
+    warped = se.render(mesh, camera, lights, material, se.LightWarp(80.0, 0.5), sigma=3.0, **SIZE)
+    np.testing.assert_allclose(warped, plain, rtol=1e-8, atol=1e-10)
+
+
+def test_jit_and_eager_agree(dtype):
+    mesh, camera, lights, material = scene(dtype)
+
+    def picture(alpha, gamma, sigma):
+        return se.render(mesh, camera, lights, material, se.LightWarp(alpha, gamma), sigma=sigma, **SIZE)
+
+    arguments = [jnp.asarray(v, dtype) for v in (25.0, 0.3, 1.5)]
+    tolerance = 2e-4 if dtype == np.float32 else 1e-10
+    np.testing.assert_allclose(picture(*arguments), jax.jit(picture)(*arguments), rtol=tolerance, atol=tolerance)
+
+
+def test_the_picture_does_not_depend_on_the_resolution():
+    mesh, camera, lights, material = scene()
+    images = [
+        se.render(mesh, camera, lights, material, se.LightWarp(25.0), sigma=8.0, height=h, width=4 * h // 3)
+        for h in (96, 192)
+    ]
+    small, large = np.asarray(images[0]), np.asarray(images[1])
+    pooled = large.reshape(96, 2, 128, 2, 3).mean(axis=(1, 3))
+    inside = np.ones((96, 128), bool)
+    mask = np.asarray(se.render_gbuffer(mesh, camera, height=96, width=128).mask)
+    for shift in (-2, 2):
+        for axis in (0, 1):
+            inside &= np.roll(mask, shift, axis)
+    difference = np.abs(small - pooled).mean(axis=-1)[inside & mask]
+    assert np.median(difference) < 0.01 * small[mask].mean()
+
+
+@pytest.mark.parametrize("what", ["alpha", "gamma", "sigma", "lights", "material", "normals", "vertices", "camera"])
+def test_gradients_against_central_differences(what, x64):
+    mesh, camera, lights, material = scene(np.float64, lights=6)
+    weights = jnp.asarray(np.random.default_rng(3).normal(size=(48, 64, 3)))
+    visibility_of = {"camera": 0, "vertices": 0}
+
+    def loss(
+        alpha=20.0,
+        gamma=0.3,
+        sigma=12.0,
+        radiance=lights.radiance,
+        shininess=material.shininess,
+        mesh=mesh,
+        camera=camera,
+    ):
+        image = se.render(
+            mesh,
+            camera,
+            se.Lights(lights.direction, radiance),
+            dataclasses.replace(material, shininess=shininess, specular=material.specular * shininess / 20),
+            se.LightWarp(alpha, gamma),
+            sigma=sigma,
+            **SIZE,
+        )
+        return jnp.sum(weights * image) / 100
+
+    if what in ("alpha", "gamma", "sigma"):
+        start = {"alpha": 20.0, "gamma": 0.3, "sigma": 12.0}[what]
+        assert_gradient(lambda v: loss(**{what: v}), jnp.asarray(start), directions=1)
+    elif what == "lights":
+        assert_gradient(lambda v: loss(radiance=v), lights.radiance)
+    elif what == "material":
+        assert_gradient(lambda v: loss(shininess=v), material.shininess, directions=1)
+    elif what == "normals":
+        assert_gradient(
+            lambda v: loss(mesh=dataclasses.replace(mesh, normals=v)), mesh.normals, steps=(1e-6, 1e-7, 1e-8)
+        )
+    else:
+        # Visibility is piecewise constant: with steps far below a pixel the differences see only what is interpolated.
+        assert what in visibility_of
+        if what == "vertices":
+            f = lambda v: loss(mesh=dataclasses.replace(mesh, vertices=v))  # noqa: E731
+            start = mesh.vertices
+        else:
+            f = lambda v: loss(camera=dataclasses.replace(camera, view=v))  # noqa: E731
+            start = camera.view
+        assert_gradient(f, start, steps=(1e-7, 1e-8, 1e-9), rtol=1e-5, atol=1e-6, directions=3)
+
+
+def test_values_do_not_recompile():
+    mesh, _, lights, material = scene()
+
+    def picture(alpha, gamma, sigma, shift):
+        moved = se.frame_mesh(mesh, direction=(0.2 + shift, 0.9, 0.7), aspect=4 / 3)
+        lamps = se.Lights(lights.direction, lights.radiance * (1 + shift))
+        stone = dataclasses.replace(material, shininess=material.shininess + shift)
+        return se.render(mesh, moved, lamps, stone, se.LightWarp(alpha, gamma), sigma=sigma, **SIZE)
+
+    picture(20.0, 0.5, 1.0, 0.0)
+    with _count_compilations() as compiled:
+        picture(35.0, 0.25, 2.0, 0.1)
+        picture(50.0, 0.75, 3.0, 0.2)
+    assert compiled == []
+
+
+class _count_compilations:
+    """Names of the functions that XLA compiles while the context is open."""
+
+    def __enter__(self):
+        self.events = []
+        self.open = True
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
+        return self.events
+
+    def _listen(self, event, duration, **_):
+        if self.open and event == "/jax/core/compile/backend_compile_duration":
+            self.events.append(event)
+
+    def __exit__(self, *_):
+        self.open = False
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda a: se.render(*a, 3, **SIZE), "enhancement is a int"),
+        (lambda a: se.render(*a, se.LightWarp(np.nan), **SIZE), "alpha is nan"),
+        (
+            lambda a: se.render(*a, se.LightWarp(1.0, 2.0), **SIZE),
+            r"gamma is 2.0; accepted are finite numbers in \[-1, 1\]",
+        ),
+        (lambda a: se.render(*a, se.RadianceScaling(0.0), **SIZE), r"invariant is 0.0"),
+        (lambda a: se.render(*a, se.LightWarp(1.0), sigma=-1.0, **SIZE), "sigma is -1"),
+        (lambda a: se.render(*a, height=0, width=4), "height is 0"),
+        (lambda a: se.render(None, *a[1:], **SIZE), "mesh is a NoneType"),
+    ],
+)
+def test_errors(call, words):
+    with pytest.raises(ValueError, match=words):
+        call(scene())
