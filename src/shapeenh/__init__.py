@@ -1,5 +1,17 @@
 """shapeenh: makes the shape of things visible. A differentiable JAX toolkit; every public name is here."""
 
+from shapeenh.buffers.gbuffer import render_gbuffer
+from shapeenh.buffers.interpolate import barycentrics, interpolate
+from shapeenh.buffers.visibility import rasterize
+from shapeenh.descriptor.display import curvature_colors
+from shapeenh.descriptor.view import (
+    describe,
+    gaussian_curvature,
+    mean_curvature,
+    principal_curvatures,
+    principal_directions,
+)
+from shapeenh.io import load_environment, load_image, load_mesh, save_image
 from shapeenh.light.brdf import ashikhmin_shirley
 from shapeenh.light.radiance import shade, shade_warped
 from shapeenh.light.warp import unwarp, warp, warp_jacobian, warp_tensor
@@ -37,18 +49,32 @@ __all__ = [
     "Visibility",
     "ashikhmin_shirley",
     "auto_exposure",
+    "barycentrics",
     "carved_knot",
     "composite",
+    "curvature_colors",
+    "describe",
     "frame_mesh",
+    "gaussian_curvature",
+    "interpolate",
+    "load_environment",
+    "load_image",
+    "load_mesh",
     "make_mesh",
+    "mean_curvature",
     "named_material",
     "orthographic_camera",
     "perspective_camera",
     "plane",
+    "principal_curvatures",
+    "principal_directions",
     "procedural_sky",
     "procedural_studio",
+    "rasterize",
+    "render_gbuffer",
     "rotate_lights",
     "sample_environment",
+    "save_image",
     "shade",
     "shade_warped",
     "sphere",

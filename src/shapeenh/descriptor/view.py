@@ -1,0 +1,217 @@
+"""The view-centred, multi-scale descriptor (LW09 section 4, TH10 4.3, SPEC 3)."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from shapeenh.checks import check_range, check_shape, check_type, float_dtype, is_concrete
+from shapeenh.descriptor import diffusion, edges, gradient
+from shapeenh.numerics import determinant, eigenvalues, safe_divide, safe_hypot
+from shapeenh.stencils import derivatives, links
+from shapeenh.types import Descriptor, GBuffer
+
+GREATEST_SIGMA = 100.0
+CREASE_DEGREES = 40.0
+
+# ------------------------------------------------------------------------------------------- curvatures
+
+
+def mean_curvature(hessian):
+    """Hm = (k1 + k2)/2 = (xx + yy)/2 (SPEC 3.8).
+
+    hessian: [..., 3] (xx, xy, yy), 1/px. Returns [...], 1/px: negative on convexities.
+    Gradient: exact.
+    """
+    check_shape("hessian", hessian, (..., 3))
+    return 0.5 * hessian[..., 0] + 0.5 * hessian[..., 2]
+
+
+def gaussian_curvature(hessian):
+    """K = k1 k2 = xx yy - xy^2 (SPEC 3.8).
+
+    hessian: [..., 3] (xx, xy, yy), 1/px. Returns [...], 1/px^2.
+    Gradient: exact.
+    """
+    check_shape("hessian", hessian, (..., 3))
+    return determinant(hessian)
+
+
+def principal_curvatures(hessian):
+    """(k1, k2) = Hm ± r, k1 >= k2 (SPEC 3.8).
+
+    hessian: [..., 3] (xx, xy, yy), 1/px. Returns two arrays [...], 1/px.
+    Gradient: exact off umbilics; there that of r is taken as 0, so that symmetric functions of both are right.
+    """
+    check_shape("hessian", hessian, (..., 3))
+    return eigenvalues(hessian)
+
+
+@jax.custom_jvp
+def _half_angle(a, b):
+    """(cos, sin) of atan2(b, a) / 2, the first not negative, as `[2, ...]`; (1, 0) at the origin with gradient 0."""
+    angle = 0.5 * jnp.arctan2(b, jnp.where((a == 0) & (b == 0), 1, a))
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+
+
+@_half_angle.defjvp
+def _half_angle_jvp(primals, tangents):
+    (a, b), (da, db) = primals, tangents
+    out = _half_angle(a, b)
+    r = safe_hypot(a, b)
+    turn = 0.5 * (safe_divide(a, r) * safe_divide(db, r) - safe_divide(b, r) * safe_divide(da, r))
+    return out, jnp.stack([-out[1], out[0]]) * turn[None]
+
+
+def principal_directions(hessian):
+    """(u, v): unit image directions (x right, y up) of the principal curvatures k1 and k2 (LW09 4.2).
+
+    hessian: [..., 3] (xx, xy, yy), 1/px. Returns two arrays [..., 2]: lines, not arrows; u has x >= 0, v is u turned by
+    90 degrees counter-clockwise. At umbilics every direction is principal: u = (1, 0).
+    Gradient: exact off umbilics, where it grows like 1/(k1 - k2); 0 where k1 - k2 is within rounding of 0. What can do
+    without directions (SPEC 3, spectral functions) should not ask for them.
+    """
+    check_shape("hessian", hessian, (..., 3))
+    a, b = 0.5 * hessian[..., 0] - 0.5 * hessian[..., 2], hessian[..., 1]
+    size = jnp.abs(hessian[..., 0]) + jnp.abs(hessian[..., 2])
+    umbilic = jnp.maximum(jnp.abs(a), jnp.abs(b)) <= jnp.finfo(hessian.dtype).eps * size
+    cos, sin = _half_angle(jnp.where(umbilic, 0, a), jnp.where(umbilic, 0, b))
+    return jnp.stack([cos, sin], axis=-1), jnp.stack([-sin, cos], axis=-1)
+
+
+# ------------------------------------------------------------------------------------------- the descriptor
+
+
+def describe(gbuffer, *, sigma=0.0, foreshortening=1.0, importance=None, creases=False) -> Descriptor:
+    """The local shape descriptor: silhouettes, creases, and curvature at a scale of `sigma` pixels (LW09 algorithm 1).
+
+    gbuffer: GBuffer. Pixels with a NaN or infinite normal count as off the mask.
+    sigma: [], px of this image, in [0, 100]: narrower details are smoothed away, never across a silhouette or crease.
+    foreshortening: [], f in [0, 4]: 1 = the surface's own slope; less tones down the rims (TH10 4.3.2).
+    importance: [H, W] or None: how many explicit diffusion steps (of 1/5) each pixel takes part in (LW09 4.3); a pixel
+        whose count is used up is frozen. With `sigma` > 0 no pixel takes more than `sigma` needs; with `sigma` = 0 the
+        counts alone decide.
+    creases: False (none computed), True (edges sharper than 40 degrees between pixels), or a threshold in degrees.
+    *Static*: whether `importance` is given and `creases` asked for; a concrete `sigma` of 0 skips the diffusion.
+    Returns a Descriptor; all its fields are 0 off the mask.
+    *Gradient*: with respect to normals, depth (through the silhouettes' flanks), sigma, foreshortening and importance.
+    *Errors*: ValueError for fields whose shapes disagree, and for numbers out of range.
+
+        descriptor = describe(render_gbuffer(mesh, camera, height=600, width=800), sigma=2.5)
+        concave = mean_curvature(descriptor.hessian) > 0
+    """
+    check_gbuffer(gbuffer)
+    shape = gbuffer.mask.shape
+    check_range("sigma", sigma, 0, GREATEST_SIGMA)
+    check_range("foreshortening", foreshortening, 0, gradient.GREATEST_FORESHORTENING)
+    check_shape("sigma", sigma, ())
+    check_shape("foreshortening", foreshortening, ())
+    if importance is not None:
+        check_shape("importance", importance, shape)
+        check_range("importance", importance, 0, 5 * GREATEST_SIGMA**2 / 2)
+    with_creases = creases is not False
+    degrees = CREASE_DEGREES if creases is True else creases
+    if with_creases:
+        check_range("creases", degrees, 0, 180, open_ends=True)
+
+    dtype = float_dtype(gbuffer.normal)
+    smooth = importance is not None or not is_concrete(sigma) or bool(np.asarray(sigma) > 0)
+    as_float = partial(jnp.asarray, dtype=dtype)
+    return _describe(
+        gbuffer,
+        as_float(sigma),
+        as_float(foreshortening),
+        None if importance is None else as_float(importance),
+        as_float(degrees),
+        smooth=smooth,
+        with_creases=with_creases,
+    )
+
+
+def check_gbuffer(gbuffer) -> None:
+    """Shapes of the fields that descriptors read."""
+    check_type("gbuffer", gbuffer, GBuffer)
+    check_shape("gbuffer.mask", gbuffer.mask, (None, None))
+    h, w = gbuffer.mask.shape
+    check_shape("gbuffer.normal", gbuffer.normal, (h, w, 3))
+    check_shape("gbuffer.position", gbuffer.position, (h, w, 3))
+    check_shape("gbuffer.depth", gbuffer.depth, (h, w))
+    if gbuffer.occlusion is not None:
+        check_shape("gbuffer.occlusion", gbuffer.occlusion, (h, w))
+
+
+@partial(jax.jit, static_argnames=("smooth", "with_creases"))
+def _describe(gbuffer, sigma, foreshortening, importance, degrees, *, smooth, with_creases):
+    # 1-2: silhouettes and creases
+    good = gradient.good_pixels(gbuffer)
+    w_s = edges.silhouettes(gbuffer, good)
+    w_c = edges.creases(gbuffer.normal, good, degrees) if with_creases else jnp.zeros_like(w_s)
+    c = edges.conductance(w_s, w_c, good)
+    link_x, link_y = links(c)
+
+    # 3: the gradient of the relative depth field
+    g = gradient.depth_gradient(gbuffer.normal, good, foreshortening)
+
+    # 4-6: diffusion, of the gradient and of the places it was measured at
+    places = None
+    if smooth:
+        budget = _budget(sigma, importance)
+        g, places = _diffuse(g, link_x, link_y, budget)
+
+    # 7: the Hessian, flat at the singular places
+    hessian = _hessian(g, places, link_x, link_y, foreshortening) * c[None]
+    return Descriptor(
+        hessian=jnp.moveaxis(hessian, 0, -1),
+        gradient=jnp.moveaxis(g, 0, -1),
+        silhouette=w_s,
+        crease=w_c,
+        conductance=c,
+    )
+
+
+def _budget(sigma, importance):
+    """The time each pixel diffuses for, [1, 1] or [H, W]: sigma^2 / 2, and importance steps of 1/5."""
+    time = (0.5 * sigma * sigma)[None, None]
+    if importance is None:
+        return time
+    counted = diffusion.STEP * importance
+    return jnp.where(time > 0, jnp.minimum(counted, time), counted)
+
+
+def _diffuse(g, link_x, link_y, budget):
+    """g, and the pixels' coordinates, diffused alike."""
+    height, width = g.shape[1:]
+    x = jnp.arange(width, dtype=g.dtype) - 0.5 * (width - 1)
+    y = 0.5 * (height - 1) - jnp.arange(height, dtype=g.dtype)
+    shape = (height, width)
+    coordinates = jnp.stack([jnp.broadcast_to(x[None], shape), jnp.broadcast_to(y[:, None], shape)])
+    both = diffusion.explicit(jnp.concatenate([g, coordinates]), link_x, link_y, budget)
+    return both[:2], both[2:]
+
+
+# Within sigma of an outline the diffused g is an average from one side only and levels off: its plain derivative
+# falls to 0 there, which pictures show as a rim. But the average was also *taken* elsewhere. Diffusion is linear, so
+# the pixels' coordinates diffused alike, X_s, say where: the derivative of g_s with respect to X_s is exact for every
+# linear g up to the outline, and in open regions, where X_s = x, it is grad g_s itself.
+
+_FLOOR = 0.01**2  # |grad X_s|^2 below which X_s counts as constant: a region much narrower than sigma is seen as flat
+
+
+def _hessian(g, places, link_x, link_y, foreshortening):
+    """H = grad g_s (grad X_s)^-1, symmetrised, as planes xx, xy, yy (SPEC 3.7)."""
+    chart = gradient.to_chart(g, foreshortening)
+    d_x, d_y = derivatives(chart, link_x, link_y)
+    g_x = gradient.from_chart(g, d_x, foreshortening)
+    g_y = gradient.from_chart(g, d_y, foreshortening)
+    if places is not None:
+        (x_x, y_x), (x_y, y_y) = derivatives(places, link_x, link_y)
+        # H = J^T (J J^T + e^2)^-1 (g_x; g_y), least squares with a floor, J = (x_x y_x; x_y y_y)
+        a, b, d = x_x * x_x + y_x * y_x + _FLOOR, x_x * x_y + y_x * y_y, x_y * x_y + y_y * y_y + _FLOOR
+        scale = (1 + _FLOOR) / (a * d - b * b)  # so that nothing changes where J = I
+        m_xx, m_xy = scale * (x_x * d - x_y * b), scale * (x_y * a - x_x * b)
+        m_yx, m_yy = scale * (y_x * d - y_y * b), scale * (y_y * a - y_x * b)
+        g_x, g_y = m_xx[None] * g_x + m_xy[None] * g_y, m_yx[None] * g_x + m_yy[None] * g_y
+    return jnp.stack([g_x[0], 0.5 * (g_x[1] + g_y[0]), g_y[1]])
