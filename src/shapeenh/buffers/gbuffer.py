@@ -1,0 +1,106 @@
+"""The G-buffer of a mesh: visibility, then everything that was asked for, resolved in one pass (SPEC 2, 11)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from shapeenh import checks
+from shapeenh.buffers.inputs import check_table
+from shapeenh.buffers.project import clip_matrix
+from shapeenh.buffers.resolve import resolve
+from shapeenh.buffers.visibility import rasterize
+from shapeenh.types import Camera, GBuffer, Mesh
+
+GRAZING = 0.01  # the least n_z
+
+
+def render_gbuffer(
+    mesh: Mesh,
+    camera: Camera,
+    *,
+    height: int,
+    width: int,
+    cull: bool | str = False,
+    albedo: bool = True,
+    uv: bool = False,
+) -> GBuffer:
+    """What the camera sees of a mesh: `rasterize`, then mask, depth, normal, position and what else was asked for.
+
+    Source: SPEC 1, 2, 11. `mesh.normals` are interpolated, turned into camera space and made unit again.
+
+    - Two-sided: where the normals of a face look away from the viewer, compared with the side of the face that is
+      seen, they are turned round. Scans with inconsistent orientation and open meshes are lit from both sides.
+    - n_z > 0 everywhere (SPEC 1). Near an outline the interpolated normal can look past the view axis by a few
+      degrees; its n_z is then held at 0.01, the bound that the descriptor uses as well, and the rest rescaled.
+
+    mesh: V vertices with normals [V, 3], optional colors and uv. camera: any OpenGL projection.
+    *Static*: height, width: pixels, 1 to 32768. cull: as in `rasterize`. albedo: whether to interpolate `mesh.colors`,
+    where there are any. uv: whether to interpolate `mesh.uv`, which must be there.
+    Returns a GBuffer; everything 0 off the mask.
+    *Gradient*: exact with respect to vertices, normals, colors, uv and both camera matrices; the mask and the
+    visibility are constants. A held n_z has no derivative.
+    *Errors*: ValueError as in `rasterize`, and for normals, colors or uv of a wrong shape or not finite.
+    """
+    seen = rasterize(mesh, camera, height=height, width=width, cull=cull)
+    check_table("mesh.normals", mesh.normals, mesh, 3)
+    tables = {"normal": mesh.normals}
+    if albedo and mesh.colors is not None:
+        check_table("mesh.colors", mesh.colors, mesh, 3)
+        tables["albedo"] = mesh.colors
+    if uv:
+        if mesh.uv is None:
+            raise ValueError("uv is True, but mesh.uv is None; accepted are meshes with uv [V, 2]")
+        check_table("mesh.uv", mesh.uv, mesh, 2)
+        tables["uv"] = mesh.uv
+    dtype = checks.float_dtype(mesh.vertices, mesh.normals, camera.view, camera.projection)
+    vertices, view, projection = (jnp.asarray(a, dtype) for a in (mesh.vertices, camera.view, camera.projection))
+    tables = {name: jnp.asarray(table, dtype) for name, table in tables.items()}
+    return resolve_gbuffer(vertices, jnp.asarray(mesh.faces, jnp.int32), tables, view, projection, seen.triangle)
+
+
+@jax.jit
+def resolve_gbuffer(vertices, faces, tables, view, projection, triangle) -> GBuffer:
+    """The jitted body of `render_gbuffer` behind the visibility, of checked arrays."""
+    names = sorted(tables, key=("normal", "albedo", "uv").index)
+    channels = {"depth": 1, "position": 3, **{name: tables[name].shape[1] for name in names}}
+    total = sum(channels.values())
+    if faces.shape[0] == 0 or vertices.shape[0] == 0:
+        planes = [jnp.zeros(triangle.shape, vertices.dtype)] * total
+    else:
+        m, _ = clip_matrix(view, projection)
+        planes = resolve(surface, vertices, [tables[name] for name in names], view, m, faces, triangle)
+    fields, at = {}, 0
+    for name, count in channels.items():
+        fields[name] = planes[0] if name == "depth" else jnp.stack(planes[at : at + count], -1)
+        at += count
+    return GBuffer(mask=triangle >= 0, **fields)
+
+
+def surface(view, b, blended, rows, inverse):
+    """Depth, camera-space position and normal, then the other attributes as they are."""
+    point, normal, *others = blended
+    x, y, z = (sum(view[k, c] * point[:, c] for c in range(3)) + view[k, 3] for k in range(3))
+    side = lax.stop_gradient(viewer_side(rows[0], rows[1], inverse))
+    n = [sum(view[k, c] * normal[:, c] for c in range(3)) * side for k in range(3)]
+    n = unit(n)
+    n = unit([n[0], n[1], jnp.maximum(n[2], GRAZING)])
+    return [-z, x, y, z, *n, *(t[:, k] for t in others for k in range(t.shape[1]))]
+
+
+def viewer_side(position, normal, inverse):
+    """-1 where the corner normals of a face look away from the side that is seen, else 1. One sign per face, so that
+    nothing flips inside of one; `inverse` is positive where the corners run counter-clockwise on screen."""
+    u = [position[:, 1, k] - position[:, 0, k] for k in range(3)]
+    v = [position[:, 2, k] - position[:, 0, k] for k in range(3)]
+    n = [normal[:, 0, k] + normal[:, 1, k] + normal[:, 2, k] for k in range(3)]
+    out = sum(n[k] * (u[(k + 1) % 3] * v[(k + 2) % 3] - u[(k + 2) % 3] * v[(k + 1) % 3]) for k in range(3))
+    return jnp.where((out * jnp.sign(inverse)) < 0, -1, 1).astype(position.dtype)
+
+
+def unit(n):
+    """n / |n|, 0 for the zero vector (and no infinite gradient there)."""
+    square = n[0] * n[0] + n[1] * n[1] + n[2] * n[2]
+    inverse = lax.rsqrt(jnp.maximum(square, jnp.finfo(square.dtype).tiny * 1e6))
+    return [t * inverse for t in n]
