@@ -133,11 +133,13 @@ def draw_large(
 
     def setup(face, rank, vertices, m, near, shift):
         index = corner_indices(faces, face)
-        snapped = [[take(plane, i) for i in index] for plane in (x, y, r)]
+        tx, ty, tr = ([take(plane, i) for i in index] for plane in (x, y, r))
         position = [take(vertices, i) for i in index]
         return large_setup(
             position,
-            *snapped,
+            tx,
+            ty,
+            tr,
             is_even(faces, face),
             rank < total,
             m,

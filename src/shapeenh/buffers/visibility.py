@@ -66,7 +66,8 @@ def visible_triangles(vertices, faces, view, projection, *, height, width, cull)
 
     @jax.custom_batching.sequential_vmap  # a batched loop would drag every view along until the last one is done
     def one_view(vertices, faces, view, projection):
-        return draw(vertices, faces, *clip_matrix(view, projection), height, width, cull)
+        m, near = clip_matrix(view, projection)
+        return draw(vertices, faces, m, near, height, width, cull)
 
     vertices, view, projection = jax.tree.map(lax.stop_gradient, (vertices, view, projection))
     return one_view(vertices, faces, view, projection)
