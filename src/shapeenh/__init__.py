@@ -15,6 +15,7 @@ from shapeenh.io import load_environment, load_image, load_mesh, save_image
 from shapeenh.light.brdf import ashikhmin_shirley
 from shapeenh.light.radiance import shade, shade_warped
 from shapeenh.light.warp import unwarp, warp, warp_jacobian, warp_tensor
+from shapeenh.pipeline import enhance, render
 from shapeenh.scene.camera import frame_mesh, orthographic_camera, perspective_camera
 from shapeenh.scene.environment import procedural_sky, procedural_studio, rotate_lights, sample_environment
 from shapeenh.scene.materials import named_material
@@ -54,6 +55,7 @@ __all__ = [
     "composite",
     "curvature_colors",
     "describe",
+    "enhance",
     "frame_mesh",
     "gaussian_curvature",
     "interpolate",
@@ -71,6 +73,7 @@ __all__ = [
     "procedural_sky",
     "procedural_studio",
     "rasterize",
+    "render",
     "render_gbuffer",
     "rotate_lights",
     "sample_environment",

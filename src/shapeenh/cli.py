@@ -246,13 +246,16 @@ def _save_buffers(folder: Path, gbuffer, descriptor) -> None:
     curvature = np.asarray(mean_curvature(descriptor.hessian))
     near, far = (depth[mask].min(), depth[mask].max()) if mask.any() else (0.0, 1.0)
     shown = np.where(mask, 1 - 0.9 * (depth - near) / max(far - near, 1e-30), 0)
-    eight_bit = lambda x: np.uint8(np.round(255 * np.clip(x, 0, 1)))  # noqa: E731
     normal = np.asarray(gbuffer.normal)
-    io.save_image(folder / "normal.png", eight_bit(np.where(mask[..., None], 0.5 + 0.5 * normal, 0)))
-    io.save_image(folder / "depth.png", eight_bit(shown))
-    io.save_image(folder / "curvature.png", curvature_colors(descriptor, gbuffer.mask))
+    io.save_image(folder / "normal.png", _eight_bit(np.where(mask[..., None], 0.5 + 0.5 * normal, 0)))
+    io.save_image(folder / "depth.png", _eight_bit(shown))
+    io.save_image(folder / "curvature.png", _eight_bit(curvature_colors(descriptor, mask=gbuffer.mask)))
     for name, numbers in (("normal", normal), ("depth", depth), ("curvature", curvature)):
         io.save_image(folder / f"{name}.tif", np.float32(numbers))
+
+
+def _eight_bit(display) -> np.ndarray:
+    return np.uint8(np.round(255 * np.clip(np.asarray(display), 0, 1)))
 
 
 def _write_json(arguments, clock, mesh, gbuffer, exposure) -> None:
