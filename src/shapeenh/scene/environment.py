@@ -351,7 +351,7 @@ def procedural_sky(*, height=128, sun=(-0.55, 0.55, 0.62)):
 
 
 def procedural_studio(*, height=128):
-    """A photographer's studio: a large key panel, a cool fill, two rim strips, an overhead bank, a graded room.
+    """A photographer's studio: a key panel, a cool fill, two rim strips, a reflector below, a graded room.
 
     *Static*: height, rows of the map (columns are twice as many).
     Returns a radiance map [h, 2h, 3], linear RGB. Key high on the left and fill on the right stand behind a viewer who
@@ -365,12 +365,11 @@ def procedural_studio(*, height=128):
     )
     warm, cool, neutral = np.array([1.0, 0.93, 0.82]), np.array([0.72, 0.85, 1.0]), np.ones(3)
     lamps = [
-        (9.0 * warm, (-0.62, 0.62, 0.70), 0.42, 0.42),
-        (1.1 * cool, (0.90, 0.10, 0.55), 0.55, 0.80),
-        (6.5 * neutral, (-0.85, 0.15, -0.45), 0.16, 1.00),
-        (6.5 * cool, (0.85, 0.25, -0.40), 0.16, 1.00),
-        (2.2 * neutral, (0.02, 1.00, -0.12), 0.70, 0.25),
-        (0.5 * warm, (0.05, -0.70, 0.75), 0.60, 0.25),
+        (26.0 * warm, (-0.55, 0.75, 0.55), 0.30, 0.30),
+        (0.7 * cool, (0.95, 0.00, 0.40), 0.45, 0.70),
+        (9.0 * neutral, (-0.90, 0.10, -0.35), 0.10, 0.90),
+        (9.0 * cool, (0.85, 0.35, -0.45), 0.12, 0.90),
+        (0.35 * warm, (0.05, -0.80, 0.60), 0.60, 0.25),
     ]
     out = np.broadcast_to(room, direction.shape).copy()
     for colour, towards, half_width, half_height in lamps:
