@@ -99,7 +99,10 @@ def _build_parser() -> argparse.ArgumentParser:
         "--background", type=_color, default="grey", metavar="NAME|#RRGGBB", help="white, black, grey or a colour"
     )
     add.add_argument(
-        "--crease", type=_number, default=None, metavar="DEG", help="split normals at edges sharper than this"
+        "--crease", type=_number, default=50.0, metavar="DEG", help="sharper edges stay sharp (default: 50)"
+    )
+    add.add_argument(
+        "--samples", type=int, default=2, help="per pixel and axis, for smooth outlines: 1 to 4 (default: 2)"
     )
     add.add_argument("--buffers", metavar="DIR", help="also write normal, depth and curvature: pictures and float TIFF")
     add.add_argument(
@@ -179,40 +182,62 @@ def cmd_render(arguments) -> None:
         _check_folder(Path(arguments.json).parent, "--json folder")
     clock = Stopwatch(repeat=arguments.json is not None)
     width, height = arguments.size
-    scale = height / pipeline.REFERENCE_HEIGHT
-
     mesh = clock.once("load mesh", lambda: _mesh(arguments))
     radiance_map = clock.once("load environment", lambda: _environment(arguments.env))
     lights = clock.once("sample environment", lambda: environment.sample_environment(radiance_map, arguments.lights))
-    camera = frame_mesh(
-        mesh, direction=_direction(*arguments.view), fov_degrees=arguments.fov, aspect=width / height, margin=0.06
-    )
+    camera = frame_mesh(mesh, direction=_direction(*arguments.view), fov_degrees=arguments.fov, aspect=width / height)
     lights = environment.rotate_lights(lights, camera)
     material = Material(**{k: jnp.asarray(v, jnp.float32) for k, v in arguments.material.items()})
     warp = LightWarp(alpha=arguments.alpha, gamma=arguments.gamma)
 
-    gbuffer = clock.stage("G-buffer", lambda: render_gbuffer(mesh, camera, height=height, width=width))
-    descriptor = clock.stage("descriptor", lambda: describe(gbuffer, sigma=arguments.sigma * scale))
+    fine = {"height": height * arguments.samples, "width": width * arguments.samples}
+    gbuffer = clock.stage("G-buffer", lambda: render_gbuffer(mesh, camera, **fine))
+    descriptor = clock.stage("descriptor", lambda: _describe(gbuffer, arguments))
     plain = clock.stage("shade", lambda: pipeline.illuminate(gbuffer, descriptor, lights, material, None))
     warped = clock.stage("shade warped", lambda: pipeline.illuminate(gbuffer, descriptor, lights, material, warp))
 
+    # Both are exposed alike; the samples of a pixel are averaged after the tone curve, as a display shows them.
     exposure = tone.auto_exposure(plain, gbuffer.mask)
-    show = lambda image: tone.composite(  # noqa: E731
-        tone.tone_map(image, exposure=exposure), gbuffer.mask, arguments.background
-    )
-    panels = [show(warped)] if arguments.only else [show(plain), show(warped)]
-    clock.once("save", lambda: io.save_image(arguments.output, np.concatenate([np.asarray(p) for p in panels], axis=1)))
+    panels = [
+        _average(
+            tone.composite(tone.tone_map(p, exposure=exposure), gbuffer.mask, arguments.background), arguments.samples
+        )
+        for p in ([warped] if arguments.only else [plain, warped])
+    ]
+    clock.once("save", lambda: io.save_image(arguments.output, np.concatenate(panels, axis=1)))
     if arguments.buffers is not None:
+        if arguments.samples > 1:  # the numbers are those of pixel centres, not averages
+            gbuffer = render_gbuffer(mesh, camera, height=height, width=width)
+            descriptor = _describe(gbuffer, arguments)
         clock.once("save buffers", lambda: _save_buffers(Path(arguments.buffers), gbuffer, descriptor))
     if arguments.json is not None:
         _write_json(arguments, clock, mesh, gbuffer, exposure)
 
 
+def _describe(gbuffer, arguments):
+    """The descriptor at the scale that the user set for 600 px; sharp edges of the mesh insulate it."""
+    scale = gbuffer.mask.shape[0] / pipeline.REFERENCE_HEIGHT
+    return describe(gbuffer, sigma=arguments.sigma * scale, creases=arguments.crease)
+
+
+def _average(image, samples: int) -> np.ndarray:
+    """Box filter over the samples of a pixel."""
+    image = np.asarray(image)
+    height, width, channels = image.shape
+    return image.reshape(height // samples, samples, width // samples, samples, channels).mean(axis=(1, 3))
+
+
 def _check_ranges(arguments) -> None:
-    for name, low, high in (("gamma", -1, 1), ("sigma", 0, 200), ("alpha", -1e6, 1e6), ("lights", 1, 65536)):
+    for name, low, high in (("gamma", -1, 1), ("sigma", 0, 10), ("alpha", -1e6, 1e6), ("lights", 1, 65536)):
         value = getattr(arguments, name)
         if not low <= value <= high:
             raise UsageError(f"--{name} is {value:g}; accepted are numbers from {low:g} to {high:g}")
+    if not 1 <= arguments.samples <= 4:
+        raise UsageError(f"--samples is {arguments.samples}; accepted are 1 to 4")
+    if max(arguments.size) * arguments.samples > LARGEST_SIDE:
+        raise UsageError(f"--size times --samples exceeds {LARGEST_SIDE}; accepted is a smaller size or --samples 1")
+    if not 0 < arguments.crease < 180:
+        raise UsageError(f"--crease is {arguments.crease:g}; accepted are degrees between 0 and 180")
     if not 0.1 <= arguments.fov <= 170:
         raise UsageError(f"--fov is {arguments.fov:g}; accepted are 0.1 to 170 degrees")
 
