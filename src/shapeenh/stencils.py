@@ -7,10 +7,27 @@ between a pixel and its right neighbour (`link_x`, [H, W-1]) and its lower neigh
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 
 from shapeenh.numerics import safe_divide
+
+
+def stored(always, function, *args):
+    """`function(*args)`, evaluated once and stored.
+
+    XLA re-fuses: it computes a producer again inside every consumer, and a stencil over a stencil over a logarithm is
+    20 times slower for it. A conditional on a predicate that is true but not known to be so is a border that fusion
+    does not cross (`optimization_barrier` is not).
+    """
+    shapes = jax.eval_shape(function, *args)
+
+    def never(*_):
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+    return lax.cond(always, function, never, *args)
+
 
 # ------------------------------------------------------------------------------------------- neighbours
 
@@ -34,49 +51,102 @@ def links(conductance):
 
 
 # ------------------------------------------------------------------------------------------- first derivatives
+#
+# Everything is padded once, so that all reads below are plain slices: `_at(a, dr, dc, rim)` is the image, and `rim`
+# pixels around it, as seen (dr, dc) further down and right.
+
+_MARGIN = 3
 
 
-def _along(planes, link, axis: int):
-    """(derivative towards growing index along `axis`, weight in [0, 1] that says how far it could be had).
+def _at(padded, dr: int, dc: int, rim: int):
+    h, w = padded.shape[-2] - 2 * _MARGIN, padded.shape[-1] - 2 * _MARGIN
+    top, left = _MARGIN - rim + dr, _MARGIN - rim + dc
+    return padded[..., top : top + h + 2 * rim, left : left + w + 2 * rim]
+
+
+def _along(planes, link, metric, dr: int, dc: int):
+    """The derivative towards (dr, dc), on the image and a rim of one pixel.
 
     Central where both neighbours may be read, (-3, 4, -1)/2 where one side is missing, a plain difference where the
     other side has but one pixel: second order everywhere but in the last case. Partial links blend the three.
+
+    Where samples are not evenly spaced, `metric` (a plane of positions along this direction) makes the one-sided
+    difference second order in that position: f1 - f0 - b (f2 - f1) with b = r^2/(2r + 1), r the ratio of both steps; it
+    is then the ratio of two such derivatives that means something.
     """
-    open_ahead, open_behind = link, shift(link, -1, axis)
-    ahead = shift(planes, 1, axis) - planes
-    behind = shift(ahead, -1, axis)
-    centred = 0.5 * (ahead + behind)
-    one_sided_ahead = ahead + 0.5 * shift(link, 1, axis) * (ahead - shift(ahead, 1, axis))
-    one_sided_behind = behind + 0.5 * shift(link, -2, axis) * (behind - shift(ahead, -2, axis))
-    derivative = (
-        open_ahead * open_behind * centred
-        + open_ahead * (1 - open_behind) * one_sided_ahead
-        + open_behind * (1 - open_ahead) * one_sided_behind
-    )
-    return derivative, 1 - (1 - open_ahead) * (1 - open_behind)
+    f0, f1, f2, e1, e2 = (_at(planes, k * dr, k * dc, 1) for k in (0, 1, 2, -1, -2))
+    ahead1, ahead2, behind1, behind2 = (_at(link, k * dr, k * dc, 1)[None] for k in (0, 1, -1, -2))
+
+    def one_sided(first, second, usable, x0, x1, x2):
+        if metric is None:
+            b = usable / 3
+        else:
+            near, far = jnp.abs(x1 - x0), jnp.abs(x2 - x1)
+            r = jnp.where(far > near, safe_divide(near, far), 1)
+            b = usable * r * r / (2 * r + 1)
+        return (first - b * second) / (1 - b)
+
+    m0, m1, m2, l1, l2 = (None if metric is None else _at(metric, k * dr, k * dc, 1)[None] for k in (0, 1, 2, -1, -2))
+    central = 0.5 * (f1 - e1)
+    ahead = one_sided(f1 - f0, f2 - f1, ahead2, m0, m1, m2)
+    behind = one_sided(f0 - e1, e1 - e2, behind2, m0, l1, l2)
+    return ahead1 * behind1 * central + ahead1 * (1 - behind1) * ahead + behind1 * (1 - ahead1) * behind
 
 
-def _across(derivative, known, link, axis: int):
-    """The derivative averaged 1:4:1 with its neighbours across, where both are there; theirs, where a pixel has none.
+def _known(link, dr: int, dc: int):
+    """How far `_along` had anything to read, in [0, 1]."""
+    return (1 - (1 - _at(link, 0, 0, 1)) * (1 - _at(link, -dr, -dc, 1)))[None]
+
+
+def _across(derivative, known, link, dr: int, dc: int):
+    """The derivative averaged 1:4:1 with its neighbours towards ±(dr, dc), where both are there; theirs, where a pixel
+    has none.
 
     With these weights the leading error is h^2/6 grad(laplace f), the same in every direction; Sobel's 1:2:1 has a
     larger one that favours the axes. Averaging with one side alone would cost an order, hence all or nothing.
     """
-    open_ahead, open_behind = link, shift(link, -1, axis)
-    ahead, behind = shift(derivative, 1, axis), shift(derivative, -1, axis)
-    known_ahead, known_behind = open_ahead * shift(known, 1, axis), open_behind * shift(known, -1, axis)
-    both = known * known_ahead * known_behind
-    theirs = safe_divide(open_ahead * ahead + open_behind * behind, known_ahead + known_behind)
-    return derivative + (both / 6) * (ahead + behind - 2 * derivative) + (1 - known) * theirs
+    h, w = derivative.shape[-2] - 2, derivative.shape[-1] - 2
+
+    def at(a, k):
+        return a[..., 1 + k * dr : 1 + k * dr + h, 1 + k * dc : 1 + k * dc + w]
+
+    ahead, behind = _at(link, 0, 0, 0)[None], _at(link, -dr, -dc, 0)[None]
+    known_ahead, known_behind = ahead * at(known, 1), behind * at(known, -1)
+    both = at(known, 0) * known_ahead * known_behind / 6
+    borrow = (1 - at(known, 0)) / jnp.maximum(known_ahead + known_behind, 1e-6)
+    return (
+        (1 - 2 * both) * at(derivative, 0)
+        + (both + borrow * ahead) * at(derivative, 1)
+        + (both + borrow * behind) * at(derivative, -1)
+    )
 
 
-def derivatives(planes, link_x, link_y):
+def derivatives(planes, link_x, link_y, always, *, places=None):
     """(d/dx, d/dy) of `[C, H, W]` planes in 1/px, y up, reading only along open links.
 
     Second order up to the outline; 0 where a pixel has no readable neighbour.
+    places: [2, H, W] or None: where the samples were taken, if not at the pixels (see `_along`); ratios of derivatives
+        are then second order in those places.
+    always: a true predicate unknown at compile time, for `stored`.
     """
-    link_x = jnp.pad(link_x, ((0, 0), (0, 1)))[None]
-    link_y = jnp.pad(link_y, ((0, 1), (0, 0)))[None]
-    dx, known_x = _along(planes, link_x, 2)
-    dy, known_y = _along(planes, link_y, 1)
-    return _across(dx, known_x, link_y, 1), -_across(dy, known_y, link_x, 2)
+    m = _MARGIN
+
+    def padded(planes, link_x, link_y, places):
+        even = [(0, 0), (m, m), (m, m)]
+        link_x = jnp.pad(link_x, ((m, m), (m, m + 1)))
+        link_y = jnp.pad(link_y, ((m, m + 1), (m, m)))
+        return jnp.pad(planes, even), link_x, link_y, None if places is None else jnp.pad(places, even)
+
+    def along(planes, link_x, link_y, places):
+        in_x, in_y = (None, None) if places is None else places
+        return _along(planes, link_x, in_x, 0, 1), _along(planes, link_y, in_y, 1, 0)
+
+    def across(d_x, d_y, link_x, link_y):
+        return (
+            _across(d_x, _known(link_x, 0, 1), link_y, 1, 0),
+            -_across(d_y, _known(link_y, 1, 0), link_x, 0, 1),
+        )
+
+    planes, link_x, link_y, places = stored(always, padded, planes, link_x, link_y, places)
+    d_x, d_y = stored(always, along, planes, link_x, link_y, places)
+    return stored(always, across, d_x, d_y, link_x, link_y)

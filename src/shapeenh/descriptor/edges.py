@@ -1,7 +1,7 @@
 """Where the depth field is singular: silhouettes, creases, and the conductance between them (SPEC 3.2 to 3.4).
 
 LW09 finds silhouettes with a Sobel filter on depth. That fires on every steep slope, too; here the step that the
-normals already predict is taken off first.
+normals already predict is taken off first. Normals and positions are planes `[3, H, W]`.
 """
 
 from __future__ import annotations
@@ -9,81 +9,81 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from shapeenh.numerics import norm, safe_divide, smoothstep
-from shapeenh.stencils import shift
+from shapeenh.stencils import shift, stored
 
-# A step counts in units of the distance between neighbouring samples on the surface: 0.25 is the error of the normals
-# of a coarse mesh (14 degrees), 0.5 a step of half a pixel between two surfaces that face the viewer.
-LOW, HIGH = 0.25, 0.5
+# A step counts in units of the distance between neighbouring samples on the surface. Shading normals of real meshes are
+# up to 20 degrees off their facets (0.34); 0.6 is a step of 0.6 pixels between two surfaces that face the viewer.
+LOW, HIGH = 0.4, 0.8
+
+
+def _pairs(array, axis: int):
+    """The two members of every pair of neighbours along `axis` (-1 or -2)."""
+    if axis == -1:
+        return array[..., :-1], array[..., 1:]
+    return array[..., :-1, :], array[..., 1:, :]
 
 
 # ------------------------------------------------------------------------------------------- pixel footprint
 
 
-def _pairs(array, axis: int):
-    """The two members of every pair of neighbours along `axis`."""
-    index = [slice(None)] * array.ndim
-    index[axis] = slice(None, -1)
-    first = array[tuple(index)]
-    index[axis] = slice(1, None)
-    return first, array[tuple(index)]
-
-
-def _pitch(coordinate, usable):
-    """(mean, spread relative to it) of the steps of `coordinate` from column to column."""
-    a, b = _pairs(coordinate, 1)
-    step = jnp.where(usable, b - a, 0)
-    count = jnp.maximum(jnp.sum(usable), 1)
-    mean = jnp.sum(step) / count
-    variance = jnp.sum(jnp.where(usable, (step - mean) ** 2, 0)) / count
-    return jnp.abs(mean), safe_divide(variance, mean * mean)
+def _total(array):
+    """Sum over an image, by two products with ones: a plain reduction is several times slower on CPU."""
+    h, w = array.shape
+    rows = jnp.matmul(array, jnp.ones(w, array.dtype), precision="highest")
+    return jnp.matmul(jnp.ones(h, array.dtype), rows, precision="highest")
 
 
 def footprint(position, depth, good):
     """World units between neighbouring pixels at each pixel's depth, [H, W]; 0 everywhere where there is no depth.
 
     Under an orthographic view `x` grows by the same amount from column to column, under perspective `x / depth` does:
-    whichever is more regular decides, so no camera is needed. Images one pixel wide are measured along the other axis.
+    whichever is more regular decides, so no camera is needed. An image one pixel wide is measured along `y`.
     """
-    depth = jnp.where(good, depth, 1)
-    x, y = (jnp.where(good, position[..., i], 0) for i in (0, 1))
-    if x.shape[1] == 1:
-        x, depth_, good_ = y.T, depth.T, good.T
-    else:
-        depth_, good_ = depth, good
-    left, right = _pairs(good_, 1)
-    flat, flat_spread = _pitch(x, left & right)
-    angle, angle_spread = _pitch(safe_divide(x, depth_), left & right)
-    varies = jnp.max(jnp.where(good, depth, -jnp.inf)) > jnp.min(jnp.where(good, depth, jnp.inf))
-    size = jnp.where(angle_spread < flat_spread, angle * depth, flat)
-    return jnp.where(good & varies, size, 0)
+    axis = -1 if depth.shape[1] > 1 else -2
+    place = position[0] if axis == -1 else position[1]
+    p, q = _pairs(good, axis)
+    usable = (p & q).astype(depth.dtype)
+    count = jnp.maximum(_total(usable), 1)
+
+    def pitch(coordinate):
+        a, b = _pairs(coordinate, axis)
+        step = usable * (b - a)
+        mean, square = _total(step) / count, _total(step * step) / count
+        return jnp.abs(mean), safe_divide(square - mean * mean, square)
+
+    on = jnp.where(good, depth, 1)
+    flat, flat_spread = pitch(place)
+    angle, angle_spread = pitch(safe_divide(place, on))
+    least = jnp.min(jnp.min(jnp.where(good, depth, jnp.inf), axis=0))
+    most = jnp.max(jnp.max(jnp.where(good, depth, -jnp.inf), axis=0))
+    return jnp.where(good & (most > least), jnp.where(angle_spread < flat_spread, angle * on, flat), 0)
 
 
 # ------------------------------------------------------------------------------------------- silhouettes
 
 
-def _step(position, normal, size, usable, axis: int):
-    """How far two neighbours are from lying on one smooth surface, in sample distances; and which one is in front.
+def _step(normal, position, size, finite, axis: int):
+    """How far two neighbours are from lying on one smooth surface, in sample distances; positive where the first of
+    them is in front, negative where the second is.
 
     With D the vector from one sample to the next and m the mean of both normals, m . D vanishes to third order on a
     smooth surface, however steep, and exactly on spheres; across a silhouette it is the step. It is measured in units
     of the sample distance that the normals predict, size / m_z. Where each sample lies behind the other's tangent plane
     the two planes meet between them: that is a convex surface or edge, however sharp, and no step at all.
     """
-    p, q = _pairs(position, axis)
-    n_p, n_q = _pairs(normal, axis)
-    size_p, size_q = _pairs(size, axis)
-    d = q - p
-    m = n_p + n_q
-    length = norm(m)
-    unit = jnp.minimum(size_p, size_q)
-    above_p, below_q = jnp.sum(n_p * d, axis=-1), jnp.sum(n_q * d, axis=-1)
-    gap = jnp.abs(above_p + below_q)
-    gap = jnp.minimum(gap, 2 * jnp.maximum(0, jnp.maximum(above_p, -below_q)))
-    gap = safe_divide(gap * jnp.maximum(m[..., 2], 0.02), unit * length * length)
-    return jnp.where(usable, gap, 0), p[..., 2] >= q[..., 2]
+    (p, q), (n_p, n_q), (size_p, size_q) = _pairs(position, axis), _pairs(normal, axis), _pairs(size, axis)
+    usable = jnp.logical_and(*_pairs(finite, axis))
+    d = [q[i] - p[i] for i in range(3)]
+    m = [n_p[i] + n_q[i] for i in range(3)]
+    above_p = n_p[0] * d[0] + n_p[1] * d[1] + n_p[2] * d[2]
+    below_q = n_q[0] * d[0] + n_q[1] * d[1] + n_q[2] * d[2]
+    gap = jnp.minimum(jnp.abs(above_p + below_q), 2 * jnp.maximum(0, jnp.maximum(above_p, -below_q)))
+    square = m[0] * m[0] + m[1] * m[1] + m[2] * m[2]
+    gap = safe_divide(gap * jnp.maximum(m[2], 0.02), jnp.minimum(size_p, size_q) * square)
+    return jnp.where(usable, jnp.where(d[2] > 0, -gap, gap), 0)
 
 
-def silhouettes(gbuffer, good):
+def silhouettes(gbuffer, normal, good, always):
     """w_s, [H, W] in [0, 1]: 1 on the far side of a depth step, 0 off the mask (LW09 4.4, SPEC 3.2).
 
     The far side alone is marked: one insulated pixel stops the diffusion, and the surface in front keeps its
@@ -92,24 +92,24 @@ def silhouettes(gbuffer, good):
 
     Gradient: with respect to position and normal through the smoothstep; none through the choice of the side.
     """
-    finite = good & jnp.isfinite(gbuffer.depth) & jnp.all(jnp.isfinite(gbuffer.position), axis=-1)
-    position = jnp.where(finite[..., None], gbuffer.position, 0)
-    normal = jnp.where(finite[..., None], jnp.clip(gbuffer.normal, -2, 2), 0)
-    size = footprint(position, gbuffer.depth, finite)
 
-    weight = jnp.zeros(good.shape, normal.dtype)
-    for axis in (0, 1):
-        p, q = _pairs(finite, axis)
-        gap, p_in_front = _step(position, normal, size, p & q, axis)
-        w = smoothstep(LOW, HIGH, gap)
-        end = [(0, 1) if i == axis else (0, 0) for i in (0, 1)]
-        start = [(1, 0) if i == axis else (0, 0) for i in (0, 1)]
-        weight = jnp.maximum(weight, jnp.pad(jnp.where(p_in_front, 0, w), end))
-        weight = jnp.maximum(weight, jnp.pad(jnp.where(p_in_front, w, 0), start))
+    def clean(position, depth):
+        position = jnp.moveaxis(position, -1, 0)
+        finite = good & jnp.isfinite(depth) & jnp.all(jnp.isfinite(position), axis=0)
+        return jnp.where(finite[None], position, 0), jnp.where(finite, depth, 1), finite
+
+    def steps(normal, position, size, finite):
+        return _step(normal, position, size, finite, -1), _step(normal, position, size, finite, -2)
+
+    position, depth, finite = stored(always, clean, gbuffer.position, gbuffer.depth)
+    size = footprint(position, depth, finite)
+    step_x, step_y = stored(always, steps, normal, position, size, finite)
+    step_x, step_y = jnp.pad(step_x, ((0, 0), (1, 1))), jnp.pad(step_y, ((1, 1), (0, 0)))
+    largest = jnp.maximum(jnp.maximum(step_x[:, :-1], -step_x[:, 1:]), jnp.maximum(step_y[:-1], -step_y[1:]))
+    weight = smoothstep(LOW, HIGH, largest)
     if gbuffer.occlusion is not None:
         open_ = jnp.where(jnp.isfinite(gbuffer.occlusion), gbuffer.occlusion, 1)
-        from_occlusion = 1 - smoothstep(0.25, 0.75, open_)
-        weight = jnp.where(jnp.any(size > 0), weight, from_occlusion)
+        weight = jnp.where(jnp.max(size) > 0, weight, 1 - smoothstep(0.25, 0.75, open_))
     return jnp.where(good, weight, 0)
 
 
@@ -117,21 +117,20 @@ def silhouettes(gbuffer, good):
 
 
 def creases(normal, good, degrees):
-    """w_c, [H, W] in [0, 1]: the largest angle between a normal and its eight neighbours', smoothstepped around
-    `degrees` (from 3/4 of it to 5/4); 0 off the mask (LW09 4.4, SPEC 3.3).
+    """w_c, [H, W] in [0, 1]: the largest angle between a normal and its eight neighbours', smoothstepped from 3/4 to
+    5/4 of `degrees`; 0 off the mask (LW09 4.4, SPEC 3.3).
     """
-    n = jnp.moveaxis(jnp.where(good[..., None], jnp.clip(normal, -2, 2), 0), -1, 0)
-    here = good.astype(n.dtype)
-    largest = jnp.zeros(good.shape, n.dtype)
+    here = good.astype(normal.dtype)
+    largest = jnp.zeros(good.shape, normal.dtype)
     for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        other = shift(shift(n, dr, 1), dc, 2)
+        other = shift(shift(normal, dr, 1), dc, 2)
         both = here * shift(shift(here, dr, 0), dc, 1)
         # the chord |a - b| = 2 sin(angle / 2) keeps small angles, which a cosine rounds away
-        angle = both * 2 * jnp.arcsin(jnp.clip(0.5 * norm(n - other, axis=0), 0, 0.999999))
-        back = shift(shift(angle, -dr, 0), -dc, 1)
-        largest = jnp.maximum(largest, jnp.maximum(angle, back))
+        chord = both * norm(normal - other, axis=0)
+        largest = jnp.maximum(largest, jnp.maximum(chord, shift(shift(chord, -dr, 0), -dc, 1)))
+    angle = 2 * jnp.arcsin(jnp.minimum(0.5 * largest, 0.999999))
     threshold = jnp.deg2rad(degrees)
-    return jnp.where(good, smoothstep(0.75 * threshold, 1.25 * threshold, largest), 0)
+    return jnp.where(good, smoothstep(0.75 * threshold, 1.25 * threshold, angle), 0)
 
 
 def conductance(silhouette, crease, good):

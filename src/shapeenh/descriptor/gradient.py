@@ -1,6 +1,6 @@
-"""The gradient of the relative depth field from normals (LW09 section 4.2, TH10 4.3.2, SPEC 3.1), and its chart.
+"""The gradient of the relative depth field from normals (LW09 4.2, TH10 4.3.2, SPEC 3.1), and a chart for it.
 
-Imports `types`, `numerics`, `checks` and `stencils` only.
+Imports nothing of ours.
 """
 
 from __future__ import annotations
@@ -11,51 +11,67 @@ LEAST_NZ = 0.01
 GREATEST_FORESHORTENING = 4.0
 
 
-def good_pixels(gbuffer):
-    """[H, W] bool: on the mask with a finite normal; all others are treated as off the mask."""
-    return gbuffer.mask & jnp.all(jnp.isfinite(gbuffer.normal), axis=-1)
+def normal_planes(gbuffer):
+    """(normals as planes [3, H, W], good [H, W] bool).
+
+    Good pixels are those on the mask with a finite normal; all others count as off the mask and hold (0, 0, 1).
+    Components beyond ±2 are no normal's and are held there.
+    """
+    n = jnp.moveaxis(gbuffer.normal, -1, 0)
+    good = gbuffer.mask & jnp.all(jnp.isfinite(n), axis=0)
+    away = jnp.asarray([0, 0, 1], n.dtype)[:, None, None]
+    return jnp.where(good[None], jnp.clip(n, -2, 2), away), good
 
 
-def depth_gradient(normal, good, foreshortening):
-    """g = -(n_x, n_y) / n_z^f as planes `[2, H, W]`; 0 where not `good` (SPEC 3.1).
+def depth_gradient(normal, foreshortening):
+    """g = -(n_x, n_y) / n_z^f as planes `[2, H, W]` (SPEC 3.1).
 
-    normal: [H, W, 3]; components beyond ±2 are no normal's and are held there, n_z is held above 0.01.
-    foreshortening: [], f >= 0; 1 = the slope of the surface.
+    normal: [3, H, W] planes; n_z is held above 0.01.
+    foreshortening: [], f >= 0; 1 = the slope of the surface; None means 1, done without logarithms.
     Gradient: exact where n_z > 0.01; with respect to n_z it is 0 below.
     """
-    n = jnp.where(good[..., None], normal, jnp.asarray([0, 0, 1], normal.dtype))
-    n_xy = jnp.clip(jnp.moveaxis(n[..., :2], -1, 0), -2, 2)
-    n_z = jnp.clip(n[..., 2], LEAST_NZ, 2)
-    return jnp.where(good[None], -n_xy * jnp.exp(-foreshortening * jnp.log(n_z))[None], 0)
+    n_z = jnp.maximum(normal[2], LEAST_NZ)
+    power = 1 / n_z if foreshortening is None else jnp.exp(-foreshortening * jnp.log(n_z))
+    return -normal[:2] * power[None]
 
 
 # ------------------------------------------------------------------------------------------- the chart
 #
-# At an occluding contour a height field has a fold: over the distance t to the outline its slope grows like 1/sqrt(t),
+# At an occluding contour a height field has a fold: at the distance t from the outline its slope grows like 1/sqrt(t),
 # and finite differences of g miss the curvature by 30 % one pixel inside. The *normal* stays smooth there. So g is
 # differentiated in the chart
-#     phi(g) = g (1 + s)^(-f/2),  s = |g|^(2/f),
-# which for f = 1 is -(n_x, n_y) again, and the chain rule leads back:
-#     dphi = (1 + s)^(-f/2) (I - s/(1+s) u u^T) dg,   u = g/|g|,
-#     dg   = (1 + s)^( f/2) (I + s u u^T) dphi.
-# On planes and at f = 0 the chart is the identity.
+#     phi(g) = g (1 + s)^(-b f / 2),  s = |g|^(2/f),
+# which for f = 1 and b = 1 is -(n_x, n_y) again, and the chain rule leads back: with u = g/|g|
+#     dphi = (1 + s)^(-b f / 2) (I - b s/(1 + s) u u^T) dg,
+#     dg   = (1 + s)^( b f / 2) (I + b s/(1 + (1 - b) s) u u^T) dphi.
+# b in [0, 1] says how much of it: after diffusion the fold is gone, and b = 0 is the identity.
 
 
 def _stretch(g, foreshortening):
-    """(s / |g|^2, s), both [H, W]; below |g| = 1e-6, where they are as good as 0 but not smooth, they are held."""
-    f = jnp.maximum(foreshortening, 0.02)
-    log_q = jnp.log(jnp.maximum(g[0] * g[0] + g[1] * g[1], 1e-12))
-    return jnp.exp((1 / f - 1) * log_q), jnp.exp(log_q / f)
+    """(q = |g|^2, s); below |g| = 1e-6, where s is as good as 0 but not smooth, both are held."""
+    q = jnp.maximum(g[0] * g[0] + g[1] * g[1], 1e-12)
+    if foreshortening is None:
+        return q, q
+    return q, jnp.exp(jnp.log(q) / jnp.maximum(foreshortening, 0.02))
 
 
-def to_chart(g, foreshortening):
+def _power(s, foreshortening, bend):
+    """(1 + s)^(b f / 2); `bend` None = 1."""
+    if foreshortening is None and bend is None:
+        return jnp.sqrt(1 + s)
+    return jnp.exp(
+        0.5 * (1 if bend is None else bend) * (1 if foreshortening is None else foreshortening) * jnp.log1p(s)
+    )
+
+
+def to_chart(g, foreshortening, bend):
     """phi(g), `[2, H, W]`."""
     _, s = _stretch(g, foreshortening)
-    return g * jnp.exp(-0.5 * foreshortening * jnp.log1p(s))[None]
+    return g / _power(s, foreshortening, bend)[None]
 
 
-def from_chart(g, change, foreshortening):
-    """The change of g, `[2, H, W]`, that belongs to a small change of phi(g)."""
-    s_over_q, s = _stretch(g, foreshortening)
-    along = s_over_q * (g[0] * change[0] + g[1] * change[1])
-    return jnp.exp(0.5 * foreshortening * jnp.log1p(s))[None] * (change + along[None] * g)
+def from_chart(g, foreshortening, bend):
+    """(scale, along), [H, W]: a small change dphi of phi(g) belongs to the change scale (I + along g g^T) dphi of g."""
+    q, s = _stretch(g, foreshortening)
+    along = s / q if bend is None else bend * s / ((1 + (1 - bend) * s) * q)
+    return _power(s, foreshortening, bend), along

@@ -11,7 +11,7 @@ import numpy as np
 from shapeenh.checks import check_range, check_shape, check_type, float_dtype, is_concrete
 from shapeenh.descriptor import diffusion, edges, gradient
 from shapeenh.numerics import determinant, eigenvalues, safe_divide, safe_hypot
-from shapeenh.stencils import derivatives, links
+from shapeenh.stencils import derivatives, links, stored
 from shapeenh.types import Descriptor, GBuffer
 
 GREATEST_SIGMA = 100.0
@@ -123,7 +123,7 @@ def describe(gbuffer, *, sigma=0.0, foreshortening=1.0, importance=None, creases
     return _describe(
         gbuffer,
         as_float(sigma),
-        as_float(foreshortening),
+        None if is_concrete(foreshortening) and np.asarray(foreshortening) == 1 else as_float(foreshortening),
         None if importance is None else as_float(importance),
         as_float(degrees),
         smooth=smooth,
@@ -145,26 +145,29 @@ def check_gbuffer(gbuffer) -> None:
 
 @partial(jax.jit, static_argnames=("smooth", "with_creases"))
 def _describe(gbuffer, sigma, foreshortening, importance, degrees, *, smooth, with_creases):
+    always = sigma >= 0
+
     # 1-2: silhouettes and creases
-    good = gradient.good_pixels(gbuffer)
-    w_s = edges.silhouettes(gbuffer, good)
-    w_c = edges.creases(gbuffer.normal, good, degrees) if with_creases else jnp.zeros_like(w_s)
+    normal, good = stored(always, gradient.normal_planes, gbuffer)
+    w_s = edges.silhouettes(gbuffer, normal, good, always)
+    w_c = edges.creases(normal, good, degrees) if with_creases else jnp.zeros_like(w_s)
     c = edges.conductance(w_s, w_c, good)
-    link_x, link_y = links(c)
+    w_s, w_c, c, link_x, link_y = stored(always, lambda *w: (*w, *links(w[-1])), w_s, w_c, c)
 
     # 3: the gradient of the relative depth field
-    g = gradient.depth_gradient(gbuffer.normal, good, foreshortening)
+    g = stored(always, gradient.depth_gradient, normal, foreshortening)
 
-    # 4-6: diffusion, of the gradient and of the places it was measured at
-    places = None
+    # 4-6: diffusion, of the gradient and of the places where it was measured
+    places, bend = None, None
     if smooth:
         budget = _budget(sigma, importance)
         g, places = _diffuse(g, link_x, link_y, budget)
+        bend = jnp.exp(-8 * jnp.max(budget))  # the fold at the outline is gone within half a pixel
 
     # 7: the Hessian, flat at the singular places
-    hessian = _hessian(g, places, link_x, link_y, foreshortening) * c[None]
+    hessian = _hessian(g, places, link_x, link_y, foreshortening, bend, always)
     return Descriptor(
-        hessian=jnp.moveaxis(hessian, 0, -1),
+        hessian=jnp.moveaxis(hessian * c[None], 0, -1),
         gradient=jnp.moveaxis(g, 0, -1),
         silhouette=w_s,
         crease=w_c,
@@ -188,8 +191,8 @@ def _diffuse(g, link_x, link_y, budget):
     y = 0.5 * (height - 1) - jnp.arange(height, dtype=g.dtype)
     shape = (height, width)
     coordinates = jnp.stack([jnp.broadcast_to(x[None], shape), jnp.broadcast_to(y[:, None], shape)])
-    both = diffusion.explicit(jnp.concatenate([g, coordinates]), link_x, link_y, budget)
-    return both[:2], both[2:]
+    # two runs of two planes: four at once overflow the cache and take three times as long
+    return tuple(diffusion.explicit(planes, link_x, link_y, budget) for planes in (g, coordinates))
 
 
 # Within sigma of an outline the diffused g is an average from one side only and levels off: its plain derivative
@@ -197,21 +200,31 @@ def _diffuse(g, link_x, link_y, budget):
 # the pixels' coordinates diffused alike, X_s, say where: the derivative of g_s with respect to X_s is exact for every
 # linear g up to the outline, and in open regions, where X_s = x, it is grad g_s itself.
 
-_FLOOR = 0.01**2  # |grad X_s|^2 below which X_s counts as constant: a region much narrower than sigma is seen as flat
+_FLOOR = 0.004**2  # |grad X_s|^2 below which X_s counts as constant: a region much narrower than sigma is seen as flat
 
 
-def _hessian(g, places, link_x, link_y, foreshortening):
+def _hessian(g, places, link_x, link_y, foreshortening, bend, always):
     """H = grad g_s (grad X_s)^-1, symmetrised, as planes xx, xy, yy (SPEC 3.7)."""
-    chart = gradient.to_chart(g, foreshortening)
-    d_x, d_y = derivatives(chart, link_x, link_y)
-    g_x = gradient.from_chart(g, d_x, foreshortening)
-    g_y = gradient.from_chart(g, d_y, foreshortening)
+    planes = gradient.to_chart(g, foreshortening, bend)
     if places is not None:
-        (x_x, y_x), (x_y, y_y) = derivatives(places, link_x, link_y)
+        planes = jnp.concatenate([planes, places])
+    planes = stored(always, lambda p: p, planes)
+    d_x, d_y = derivatives(planes, link_x, link_y, always, places=places)
+
+    def assemble(g, d_x, d_y):
+        scale, along = gradient.from_chart(g, foreshortening, bend)
+        s_x, s_y = along * (g[0] * d_x[0] + g[1] * d_x[1]), along * (g[0] * d_y[0] + g[1] * d_y[1])
+        u_x, v_x = scale * (d_x[0] + s_x * g[0]), scale * (d_x[1] + s_x * g[1])
+        u_y, v_y = scale * (d_y[0] + s_y * g[0]), scale * (d_y[1] + s_y * g[1])
+        if d_x.shape[0] == 2:
+            return jnp.stack([u_x, 0.5 * (v_x + u_y), v_y])
         # H = J^T (J J^T + e^2)^-1 (g_x; g_y), least squares with a floor, J = (x_x y_x; x_y y_y)
+        x_x, y_x, x_y, y_y = d_x[2], d_x[3], d_y[2], d_y[3]
         a, b, d = x_x * x_x + y_x * y_x + _FLOOR, x_x * x_y + y_x * y_y, x_y * x_y + y_y * y_y + _FLOOR
-        scale = (1 + _FLOOR) / (a * d - b * b)  # so that nothing changes where J = I
-        m_xx, m_xy = scale * (x_x * d - x_y * b), scale * (x_y * a - x_x * b)
-        m_yx, m_yy = scale * (y_x * d - y_y * b), scale * (y_y * a - y_x * b)
-        g_x, g_y = m_xx[None] * g_x + m_xy[None] * g_y, m_yx[None] * g_x + m_yy[None] * g_y
-    return jnp.stack([g_x[0], 0.5 * (g_x[1] + g_y[0]), g_y[1]])
+        unit = (1 + _FLOOR) / (a * d - b * b)  # so that nothing changes where J = I
+        m_xx, m_xy = unit * (x_x * d - x_y * b), unit * (x_y * a - x_x * b)
+        m_yx, m_yy = unit * (y_x * d - y_y * b), unit * (y_y * a - y_x * b)
+        xy = (m_xx * v_x + m_xy * v_y) + (m_yx * u_x + m_yy * u_y)
+        return jnp.stack([m_xx * u_x + m_xy * u_y, 0.5 * xy, m_yx * v_x + m_yy * v_y])
+
+    return assemble(g, d_x, d_y)
