@@ -11,6 +11,9 @@ singular, at the poles: at l = z its factor v is 0, at l = -z it is a convention
 
 from __future__ import annotations
 
+import functools
+from fractions import Fraction
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,9 +30,41 @@ def _scaled_curvature(k, alpha):
     return jnp.clip(alpha * k, -bound, bound)
 
 
+@functools.cache
+def _tangent_series(ratio: Fraction, eps: float) -> tuple[float, ...]:
+    """Taylor coefficients of tan(ratio atan(s))/s in s^2, to eps at |s| = tan(pi/16).
+
+    From f' (1 + s^2) = ratio (1 + f^2): the coefficient of each power follows from the ones before it.
+    """
+    f = [Fraction(0), ratio]
+    while float(abs(f[-1])) * np.tan(np.pi / 16) ** (len(f) - 2) > eps / 8:
+        n = len(f)  # the next power is n + 1, from the one of f' at s^n; f is odd
+        square = sum((f[i] * f[n - i] for i in range(1, n, 2)), Fraction(0))
+        f += [Fraction(0), (ratio * square - (n - 1) * f[n - 1]) / (n + 1)]
+    return tuple(float(a) for a in f[1::2])
+
+
+def _half_angle(x):
+    """tan(a/2) from x = tan(a), |a| < pi/2."""
+    return x / (1 + jnp.sqrt(1 + x * x))
+
+
+def _tangent_of_multiple(s, ratio: Fraction):
+    """tan(ratio a) from s = tan(a), |a| <= pi/16."""
+    square = s * s
+    series = _tangent_series(ratio, float(np.finfo(s.dtype).eps))
+    total = jnp.full_like(s, series[-1])
+    for a in series[-2::-1]:
+        total = total * square + a
+    return total * s
+
+
 def _half_tangent(x):
-    """t = tan(atan(x)/6), |t| < tan(pi/12) = 0.268. Then lam = tan(atan(x)/6 + pi/4) = (1 + t)/(1 - t): 1 at x = 0."""
-    return jnp.tan(jnp.arctan(x) / 6)
+    """t = tan(atan(x)/6), |t| <= tan(pi/12) = 0.268. Then lam = tan(atan(x)/6 + pi/4) = (1 + t)/(1 - t): 1 at x = 0.
+
+    By half angles and a short series: only roots and products, which vectorise; atan and tan are library calls.
+    """
+    return _tangent_of_multiple(_half_angle(_half_angle(_half_angle(x))), Fraction(4, 3))
 
 
 def _factor(x):
@@ -46,14 +81,18 @@ def _factor_slope(x):
 def _factor_difference(x1, x2, dx):
     """lam(x1) - lam(x2), where dx = x1 - x2 is known better than their difference.
 
-    It is 2 (t1 - t2)/((1 - t1)(1 - t2)) with t1 - t2 = tan(a)(1 + t1 t2) and 6 a = atan(x1) - atan(x2) =
-    atan2(dx, 1 + x1 x2): no cancellation. Both arguments are scaled by 1/max(1, |x|), which keeps them finite.
+    It is 2 (t1 - t2)/((1 - t1)(1 - t2)) with t1 - t2 = tan(a/6)(1 + t1 t2) and tan(a) = dx / (1 + x1 x2), |a| < pi: no
+    cancellation. Numerator and denominator are scaled by 1/max(1, |x|) of both, which keeps them finite.
     """
     t1, t2 = _half_tangent(x1), _half_tangent(x2)
     s1, s2 = 1 / jnp.maximum(1, jnp.abs(x1)), 1 / jnp.maximum(1, jnp.abs(x2))
     along = s1 * s2 + jnp.clip(x1, -1, 1) * jnp.clip(x2, -1, 1)
-    angle = jnp.arctan2(dx * jnp.minimum(s1, s2) * jnp.maximum(s1, s2), along) / 6
-    return 2 * jnp.tan(angle) * (1 + t1 * t2) / ((1 - t1) * (1 - t2))
+    across = dx * jnp.minimum(s1, s2) * jnp.maximum(s1, s2)
+    length = jnp.sqrt(along * along + across * across)
+    obtuse = along < 0  # then `along + length` would cancel
+    half = jnp.where(obtuse, length - along, across) / jnp.where(obtuse, across, along + length)
+    sixth = _tangent_of_multiple(_half_angle(_half_angle(_half_angle(half))), Fraction(8, 3))
+    return 2 * sixth * (1 + t1 * t2) / ((1 - t1) * (1 - t2))
 
 
 def _divided_difference(k1, k2, alpha):
