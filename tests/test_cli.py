@@ -57,7 +57,7 @@ def test_only_buffers_and_json(mesh_file, tmp_path, capsys):
     assert depth.shape == (36, 48)
     np.testing.assert_allclose(np.linalg.norm(normal[depth > 0], axis=-1), 1, atol=1e-4)
     record = json.loads(capsys.readouterr().out)
-    assert record["parameters"]["alpha"] == 40.0
+    assert record["parameters"]["alpha"] == 30.0
     assert record["triangles"] == 576
     assert set(record["seconds"]["shade warped"]) == {"compile", "run"}
 

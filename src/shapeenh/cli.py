@@ -78,7 +78,7 @@ def _build_parser() -> argparse.ArgumentParser:
     )
     add.add_argument("--only", action="store_true", help="the enhanced picture alone, without the original beside it")
     add.add_argument(
-        "--alpha", type=_number, default=40.0, help="strength of the warp, px at 600 px height (default: 40)"
+        "--alpha", type=_number, default=30.0, help="strength of the warp, px at 600 px height (default: 30)"
     )
     add.add_argument("--gamma", type=_number, default=0.0, help="contrast exponent, -1 to 1 (default: 0)")
     add.add_argument(
@@ -99,7 +99,7 @@ def _build_parser() -> argparse.ArgumentParser:
         "--background", type=_color, default="grey", metavar="NAME|#RRGGBB", help="white, black, grey or a colour"
     )
     add.add_argument(
-        "--crease", type=_number, default=50.0, metavar="DEG", help="sharper edges stay sharp (default: 50)"
+        "--crease", type=_number, default=70.0, metavar="DEG", help="sharper edges stay sharp (default: 70)"
     )
     add.add_argument(
         "--samples", type=int, default=2, help="per pixel and axis, for smooth outlines: 1 to 4 (default: 2)"
