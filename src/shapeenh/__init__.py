@@ -1,7 +1,13 @@
 """shapeenh: makes the shape of things visible. A differentiable JAX toolkit; every public name is here."""
 
+from shapeenh.buffers.estimate import estimate_normals, estimate_radius
 from shapeenh.buffers.gbuffer import render_gbuffer
 from shapeenh.buffers.interpolate import barycentrics, interpolate
+from shapeenh.buffers.normal_map import apply_normal_map
+from shapeenh.buffers.normals import decode_normals
+from shapeenh.buffers.points import gbuffer_from_points
+from shapeenh.buffers.sources import gbuffer_from_height, gbuffer_from_normals
+from shapeenh.buffers.textures import apply_texture, sample_texture
 from shapeenh.buffers.visibility import rasterize
 from shapeenh.descriptor.display import curvature_colors
 from shapeenh.descriptor.view import (
@@ -11,6 +17,10 @@ from shapeenh.descriptor.view import (
     principal_curvatures,
     principal_directions,
 )
+from shapeenh.fit.contrast import contrast
+from shapeenh.fit.picture import FitResult
+from shapeenh.fit.to_contrast import fit_contrast
+from shapeenh.fit.to_image import fit_image
 from shapeenh.io import load_environment, load_image, load_mesh, save_image
 from shapeenh.light.brdf import ashikhmin_shirley
 from shapeenh.light.radiance import shade, shade_warped
@@ -39,6 +49,7 @@ from shapeenh.types import (
 __all__ = [
     "Camera",
     "Descriptor",
+    "FitResult",
     "GBuffer",
     "LightWarp",
     "Lights",
@@ -48,16 +59,27 @@ __all__ = [
     "Profile",
     "RadianceScaling",
     "Visibility",
+    "apply_normal_map",
+    "apply_texture",
     "ashikhmin_shirley",
     "auto_exposure",
     "barycentrics",
     "carved_knot",
     "composite",
+    "contrast",
     "curvature_colors",
+    "decode_normals",
     "describe",
     "enhance",
+    "estimate_normals",
+    "estimate_radius",
+    "fit_contrast",
+    "fit_image",
     "frame_mesh",
     "gaussian_curvature",
+    "gbuffer_from_height",
+    "gbuffer_from_normals",
+    "gbuffer_from_points",
     "interpolate",
     "load_environment",
     "load_image",
@@ -77,6 +99,7 @@ __all__ = [
     "render_gbuffer",
     "rotate_lights",
     "sample_environment",
+    "sample_texture",
     "save_image",
     "shade",
     "shade_warped",

@@ -28,7 +28,7 @@ def check_shape(name: str, array, shape: tuple) -> None:
     given = tuple(np.shape(array))
     wanted = shape[1:] if shape and shape[0] is Ellipsis else shape
     tail = given[len(given) - len(wanted) :] if len(given) >= len(wanted) else None
-    fits = tail is not None and (len(given) == len(wanted) or shape[0] is Ellipsis)
+    fits = tail is not None and (len(given) == len(wanted) or wanted is not shape)
     if not fits or any(w is not None and w != g for w, g in zip(wanted, tail or (), strict=False)):
         text = ", ".join("..." if s is Ellipsis else "any" if s is None else str(s) for s in shape)
         raise ValueError(f"{name} has shape {given}; accepted is [{text}]")
