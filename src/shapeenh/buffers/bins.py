@@ -1,88 +1,131 @@
 """Faces sorted into size classes without sorting.
 
-One pass gives every face a class: 0 = nothing to draw (culled, off the image, without area, or between pixel centres),
-k = its pixel centres fit the window WINDOWS[k - 1], len(WINDOWS) + 1 = large, or cut by the near plane. The faces of a
-class are then *found*, in ascending order and as they are needed: bit words, prefix counts of their population, and a
-bisection for the n-th bit. That is several times faster than a sort or a compaction, has no capacity, and cannot
-overflow.
+Every face gets a class: 0 = nothing to draw (culled, off the image, without area, or between pixel centres), k = its
+pixel centres fit the window WINDOWS[k - 1], LARGE = larger, or cut by the near plane. The faces of a class are then
+*found*, in ascending order and as they are needed: bit words, prefix counts of their population, and a bisection for
+the n-th bit. That is several times faster than a sort or a compaction, has no capacity, and cannot overflow.
 """
 
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from shapeenh.buffers.project import BEHIND, double_area, faces_viewer, pixel_box, three
-from shapeenh.buffers.xla import lower_bound, take
+from shapeenh.buffers.xla import lower_bound, stored, take
 
 WINDOWS = ((2, 2), (4, 4), (8, 8))  # rows, columns
-LANES = 64  # bit k of word (block, lane) is face block * 32 * LANES + k * LANES + lane: neighbours stay neighbours
+LARGE = len(WINDOWS) + 1
+LANES = 64  # bit k of word LANES * j + lane is face 32 * LANES * j + LANES * k + lane: neighbours stay neighbours
+BLOCK = 16 * 32 * LANES  # faces per step: what is computed on the way stays in cache
 LONG = 1 << 14  # beyond this extent (64 px) int32 areas could overflow: decided later, in 64 bits
 
 
 def classify(x, y, height, width, cull):
-    """Class [F] uint8 of faces with snapped corners x, y (three planes [F] each)."""
+    """Class [F] uint8 of faces with snapped corners x, y [3, F]."""
     x0, x1, y0, y1 = pixel_box(x, y, height, width)
     columns, rows = x1 - x0 + 1, y1 - y0 + 1
-    large = len(WINDOWS) + 1
-    kind = jnp.full(columns.shape, large, jnp.int32)
+    kind = jnp.full(columns.shape, LARGE, jnp.int32)
     for k in reversed(range(len(WINDOWS))):
         kind = jnp.where((rows <= WINDOWS[k][0]) & (columns <= WINDOWS[k][1]), k + 1, kind)
     low_x, high_x = three(jnp.minimum, x), three(jnp.maximum, x)
     extent = jnp.maximum(high_x - low_x, three(jnp.maximum, y) - three(jnp.minimum, y))
     drawn = jnp.where(faces_viewer(double_area(x, y), cull), kind, 0)
-    kind = jnp.where(extent >= LONG, large, drawn)
+    kind = jnp.where(extent >= LONG, LARGE, drawn)
     kind = jnp.where((columns > 0) & (rows > 0), kind, 0)
-    cut = jnp.where(low_x == BEHIND, 0, large)
+    cut = jnp.where(low_x == BEHIND, 0, LARGE)
     return jnp.where(high_x == BEHIND, cut, kind).astype(jnp.uint8)
 
 
-def class_words(kind, classes):
-    """Bit words [classes, n] uint32 of the classes 1..classes, and the inclusive counts of their bits [classes, n]."""
-    n = -(-kind.shape[0] // (32 * LANES)) * 32 * LANES
-    blocks = jnp.pad(kind, (0, n - kind.shape[0])).reshape(-1, 32, LANES)
-    words = []
-    for c in range(1, classes + 1):
-        word = jnp.zeros((blocks.shape[0], LANES), jnp.uint32)
-        for k in range(32):
-            word = word | jnp.where(blocks[:, k] == c, jnp.uint32(1 << k), jnp.uint32(0))
-        words.append(word.reshape(-1))
-    return jnp.stack(words)
+def class_words(kind):
+    """Bit words [LARGE, n] uint32 of the classes 1..LARGE, from kind [n * 32]."""
+    blocks = kind.reshape(-1, 32, LANES)
+    classes = np.arange(1, LARGE + 1, dtype=np.uint8)[:, None, None]
+    words = jnp.zeros((LARGE, blocks.shape[0], LANES), jnp.uint32)
+    for k in range(32):
+        words = words | jnp.where(blocks[None, :, k] == classes, jnp.uint32(1 << k), jnp.uint32(0))
+    return words.reshape(LARGE, -1)
 
 
-def bit_counts(words):
-    return jnp.cumsum(lax.population_count(words).astype(jnp.int32), axis=1)
+def bin_faces(always, faces, corners, height, width, cull):
+    """Bit words [LARGE, n] and the inclusive counts of their bits, of faces [F, 3] and corners [3, V].
+
+    The last block is moved back so that it ends with the last face; what it shares with the one before counts there.
+    """
+    count, vertices = faces.shape[0], corners.shape[1]
+    size, blocks = block_size(count)
+    flat = corners.reshape(-1)
+    if blocks == 1:
+        faces = jnp.pad(faces, ((0, size - count), (0, 0)))
+
+    def step(i, words):
+        start = block_start(i, count)
+
+        def fetch(faces):
+            index = lax.dynamic_slice(faces, (start, jnp.int32(0)), (size, 3)).T
+            return take(flat, index[None] + (np.arange(2, dtype=np.int32) * vertices)[:, None, None])
+
+        xy = stored(always, fetch, faces)
+
+        def kinds(xy):
+            face = start + lax.iota(jnp.int32, size)
+            new = (face >= i * size) & (face < count)
+            return jnp.where(new, classify(xy[0], xy[1], height, width, cull), jnp.uint8(0))
+
+        new = stored(always, class_words, stored(always, kinds, xy))
+        return lax.dynamic_update_slice(words, new, (jnp.int32(0), i * (size // 32)))
+
+    words = jnp.zeros((LARGE, blocks * size // 32), jnp.uint32)
+    words = lax.fori_loop(jnp.int32(0), jnp.int32(blocks), step, words)
+    return words, jnp.cumsum(lax.population_count(words).astype(jnp.int32), axis=1, dtype=jnp.int32)
 
 
-def select(words, ends, rank):
-    """Index of the face that is number `rank` of its class: the word by bisection over the counts, the bit by
-    bisection over population counts."""
-    at = lower_bound(ends, rank)
-    word = take(words, at)
-    k = rank - (take(ends, at) - lax.population_count(word).astype(jnp.int32))
+def block_size(count):
+    """Faces per block, and blocks."""
+    blocks = -(-count // BLOCK)
+    return (BLOCK if blocks > 1 else -(-count // (32 * LANES)) * 32 * LANES), blocks
+
+
+def block_start(block, count):
+    """The first face of a block."""
+    size, blocks = block_size(count)
+    return jnp.minimum(block * size, count - size) if blocks > 1 else block * 0
+
+
+def select(words, ends, row, rank, count):
+    """Index of the face that is number `rank` [n] of the class in this row, of `count` faces in all: its word by
+    bisection over the counts, its bit by bisection over population counts. words and ends are flat."""
+    n = words.shape[0] // LARGE
+    at = lower_bound(ends, row * n, n, rank)
+    word = take(words, row * n + at)
+    k = rank - (take(ends, row * n + at) - lax.population_count(word).astype(jnp.int32))
     bit = jnp.zeros(rank.shape, jnp.int32)
     for half in (16, 8, 4, 2, 1):
         low = word & jnp.uint32((1 << half) - 1)
-        count = lax.population_count(low).astype(jnp.int32)
-        up = k >= count
-        k = jnp.where(up, k - count, k)
+        below = lax.population_count(low).astype(jnp.int32)
+        up = k >= below
+        k = jnp.where(up, k - below, k)
         bit = jnp.where(up, bit + half, bit)
         word = jnp.where(up, word >> half, low)
-    return (at // LANES) * (32 * LANES) + bit * LANES + at % LANES
+    block = block_size(count)[0] // 32
+    within = at % block
+    return block_start(at // block, count) + (within // LANES) * (32 * LANES) + bit * LANES + within % LANES
 
 
 def corner_indices(faces, face):
-    """The three vertex indices of each face in ascending order.
+    """The vertex indices [3, n] of faces [n]; `faces` is flat."""
+    return take(faces, face[None] * 3 + np.arange(3, dtype=np.int32)[:, None])
+
+
+def ascending(index):
+    """The same corners [3, n] in ascending order, and whether that is a rotation of the face's own order.
 
     A canonical order makes everything computed from it independent of how the face lists its corners: two copies of a
     face, one of them turned over, get the same depth to the bit, and the lowest index wins.
     """
-    a, b, c = (take(plane, face) for plane in faces)
+    a, b, c = index
     low, high = jnp.minimum(a, b), jnp.maximum(a, b)
-    return jnp.minimum(low, c), jnp.maximum(low, jnp.minimum(high, c)), jnp.maximum(high, c)
-
-
-def is_even(faces, face):
-    """Whether the ascending order is a rotation of the face's own, so that it keeps the sign of the area."""
-    a, b, c = (take(plane, face) for plane in faces)
-    return ((a < b) & (b < c)) | ((b < c) & (c < a)) | ((c < a) & (a < b))
+    ordered = [jnp.minimum(low, c), jnp.maximum(low, jnp.minimum(high, c)), jnp.maximum(high, c)]
+    even = ((a < b) & (b < c)) | ((b < c) & (c < a)) | ((c < a) & (a < b))
+    return jnp.stack(ordered), even

@@ -56,21 +56,23 @@ def snap(value):
 
 
 def project(vertices, m, near, height, width):
-    """Snapped x, y [V] int32 and nearness r [V] float32; x = BEHIND for what the near plane cuts off.
-
-    NaN vertices count as behind: every comparison with them is false.
-    """
+    """Snapped corners [3, V] int32: x, y, and the bits of the float32 nearness. x = BEHIND for what the near plane cuts
+    off, and for NaN vertices: every comparison with them is false."""
     cx, cy, c, w = transform(vertices, m)
     seen = (w > 0) & (c <= near * w)
     w = jnp.where(seen, w, 1)
     x, y = window(cx, cy, w, height, width)
-    r = lax.convert_element_type(c / w, jnp.float32)
-    return jnp.where(seen, snap(x), BEHIND), snap(y), r, seen
+    r = lax.bitcast_convert_type(lax.convert_element_type(c / w, jnp.float32), jnp.int32)
+    return jnp.stack([jnp.where(seen, snap(x), BEHIND), snap(y), r])
 
 
-def nearness_shift(r, seen):
-    """What to subtract from r so that no vertex has a negative one: its bits then sort as integers do."""
-    return jnp.min(jnp.where(seen, r, 0), initial=np.float32(0))
+def nearness(bits):
+    return lax.bitcast_convert_type(bits, jnp.float32)
+
+
+def nearness_shift(corners):
+    """What to subtract from every nearness so that none is negative: its bits then sort as integers do."""
+    return jnp.min(jnp.where(corners[0] == BEHIND, 0, nearness(corners[2])), initial=np.float32(0))
 
 
 # ------------------------------------------------------------------------------------------- three vertices at a time

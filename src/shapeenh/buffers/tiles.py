@@ -13,180 +13,167 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from shapeenh.buffers.bins import corner_indices, is_even, select
-from shapeenh.buffers.project import BEHIND, FAR_OFF, GUARD, ONE, SUB, faces_viewer, three, top_left, transform
+from shapeenh.buffers.project import BEHIND, FAR_OFF, GUARD, ONE, SUB, faces_viewer, nearness, three, top_left
 from shapeenh.buffers.windows import merge, window_keys
-from shapeenh.buffers.xla import lower_bound, stored, take
+from shapeenh.buffers.xla import stored, take
 
 TILE = 8
+BITS = TILE.bit_length() - 1
 FACES = 256  # faces per step
 PAIRS = 1024  # (face, tile) pairs per step
 SLOPE = float(1 << 26)  # size of the integer direction of a line through a homogeneous point: 1/1024 px over 65,536 px
-LINES = ((1, 2, 0, 1), (0, 2, 1, -1), (0, 1, 2, 1))  # from, to (ascending), opposite corner, parity
+FROM, TO, PARITY = np.array([1, 0, 0]), np.array([2, 2, 1]), np.array([1, -1, 1])  # the line opposite to corner 0, 1, 2
+LIMIT = 1 << 30  # within a tile |a dx + b dy| is less: an edge function further from zero than that keeps its sign
 
-F64, I64, I32 = jnp.float64, jnp.int64, jnp.int32
+F64, I64, I32, F32 = jnp.float64, jnp.int64, jnp.int32, jnp.float32
 
 
 def cast(value, dtype):
     return lax.convert_element_type(value, dtype)
 
 
-def line(p, snapped, x, y, i, j):
-    """The line through corners i and j: float64 (a, b, c), and integers with the same sign everywhere."""
-    a = p[i][1] * p[j][2] - p[i][2] * p[j][1]
-    b = p[i][2] * p[j][0] - p[i][0] * p[j][2]
-    c = p[i][0] * p[j][1] - p[i][1] * p[j][0]
-    both = snapped[i] & snapped[j]  # then a, b, c are exact integers already
-    size = jnp.maximum(jnp.abs(a), jnp.abs(b))
-    scale = jnp.where(both, 1.0, SLOPE / jnp.maximum(size, 1e-300))
-    ia, ib = cast(jnp.rint(a * scale), I64), cast(jnp.rint(b * scale), I64)
-    anchor_x, anchor_y = (cast(jnp.where(snapped[i], t[i], t[j]), I64) for t in (x, y))
-    through = -(ia * anchor_x + ib * anchor_y)
-    free = cast(jnp.clip(jnp.rint(c * scale), -(2.0**58), 2.0**58), I64)
-    return (a, b, c), (ia, ib, jnp.where(snapped[i] | snapped[j], through, free))
-
-
-def visible_box(p, x, y, front, depth, height, width):
-    """First and last pixel that the part in front of the near plane can touch: front corners, and the points where
-    edges cross the plane (those with a pixel's margin)."""
-    low = [jnp.full(x[0].shape, np.inf, F64) for _ in range(2)]
-    high = [-a for a in low]
-
-    def add(valid, point, margin):
-        for k in range(2):
-            low[k] = jnp.where(valid, jnp.minimum(low[k], point[k] - margin), low[k])
-            high[k] = jnp.where(valid, jnp.maximum(high[k], point[k] + margin), high[k])
-
-    for k in range(3):
-        add(front[k], (cast(x[k], F64), cast(y[k], F64)), 0.0)
-    for i, j, _, _ in LINES:
-        gap = depth[i] - depth[j]
-        t = jnp.clip(depth[i] / jnp.where(gap == 0, 1.0, gap), 0.0, 1.0)
-        cut = [p[i][k] + t * (p[j][k] - p[i][k]) for k in range(3)]
-        w = jnp.maximum(cut[2], 1e-300)
-        point = [jnp.clip(cut[k] / w, -float(FAR_OFF), float(FAR_OFF)) for k in range(2)]
-        add(front[i] != front[j], point, float(ONE))
-
-    def first(value):
-        return cast(jnp.ceil(jnp.clip(value, 0.0, 2.0**30) / ONE), I32)
-
-    def last(value, limit):
-        return cast(jnp.floor(jnp.clip(value, -float(ONE), (limit - 1.0) * ONE) / ONE), I32)
-
-    return first(low[0]), last(high[0], width), first(low[1]), last(high[1], height)
-
-
-def large_setup(position, x, y, r, even, valid, m, near, shift, *, height, width, cull):
-    """Integer lines, the nearness plane, and the tiles of n faces, from world positions [n, 3] and snapped x, y, r."""
-    clip = [transform(cast(t, F64), cast(m, F64)) for t in position]
-    near, shift = cast(near, F64), cast(shift, F64)
-    front = [x[k] != BEHIND for k in range(3)]
-    snapped = [front[k] & (jnp.abs(x[k]) <= GUARD) & (jnp.abs(y[k]) <= GUARD) for k in range(3)]
+def homogeneous(position, xyr, m, near, shift, height, width):
+    """Float64 [8, 3, n] of world positions [3, 3, n]: homogeneous window coordinates x, y, w; the same with corners
+    that can be snapped in their place, w = 1; nearness times the latter w; depth beyond the near plane."""
+    cx, cy, c, w = sum(m[:, k, None, None] * position[k][None] for k in range(3)) + m[:, 3, None, None]
     half_x, half_y = width * ONE / 2, height * ONE / 2
-    free, mixed, weight, depth = [], [], [], []
-    for k in range(3):
-        cx, cy, c, w = clip[k]
-        point = ((cx + w) * half_x - w * (ONE // 2), (w - cy) * half_y - w * (ONE // 2), w)
-        exact = (cast(x[k], F64), cast(y[k], F64), jnp.ones_like(w))
-        free.append(point)
-        mixed.append([jnp.where(snapped[k], e, h) for e, h in zip(exact, point, strict=True)])
-        weight.append(jnp.where(snapped[k], cast(r[k], F64), c) - shift * mixed[k][2])
-        depth.append(near * w - c)
-    finite = jnp.isfinite(sum(t for corner in clip for t in corner))
+    free = [(cx + w) * half_x - w * (ONE // 2), (w - cy) * half_y - w * (ONE // 2), w]
+    at = snapped(xyr)
+    exact = [cast(xyr[0], F64), cast(xyr[1], F64), jnp.ones_like(w)]
+    mixed = [jnp.where(at, e, f) for e, f in zip(exact, free, strict=True)]
+    weight = jnp.where(at, cast(nearness(xyr[2]), F64), c) - shift * mixed[2]
+    return jnp.stack([*free, *mixed, weight, near * w - c])
 
-    lines = {opposite: line(mixed, snapped, x, y, i, j) for i, j, opposite, _ in LINES}
-    a, b, c = lines[2][0]
-    area = a * mixed[2][0] + b * mixed[2][1] + c * mixed[2][2]
-    inverse = 1 / jnp.where(area == 0, 1.0, area)
-    sign = jnp.where(area < 0, -1, 1).astype(jnp.int64)
-    edges, plane = [], [jnp.zeros_like(area)] * 3
-    for _, _, k, parity in LINES:
-        ia, ib, ic = (t * (sign * parity) for t in lines[k][1])
-        edges.append((ia, ib, (ic - jnp.where(top_left(ia, ib), 0, 1)) >> SUB))
-        plane = [s + t * (weight[k] * inverse * parity) for s, t in zip(plane, lines[k][0], strict=True)]
 
-    whole = front[0] & front[1] & front[2]
-    shifted = [cast(cast(r[k], F64) - shift, jnp.float32) for k in range(3)]
-    limit = cast(near - shift, jnp.float32)
-    lowest = three(jnp.minimum, [jnp.where(front[k], shifted[k], np.float32(np.inf)) for k in range(3)])
-    highest = jnp.where(whole, three(jnp.maximum, shifted), limit)
-    bound = jnp.where(whole, np.float32(np.inf), limit)
+def snapped(xyr):
+    return (xyr[0] != BEHIND) & (jnp.abs(xyr[0]) <= GUARD) & (jnp.abs(xyr[1]) <= GUARD)
 
-    x0, x1, y0, y1 = visible_box(free, x, y, front, depth, height, width)
-    bits = TILE.bit_length() - 1
-    tx, ty = x0 >> bits, y0 >> bits
-    columns, rows = (x1 >> bits) - tx + 1, (y1 >> bits) - ty + 1
+
+def lines(mixed):
+    """Float64 (a, b, c) [3, 3, n] of the lines opposite to each corner, exact integers where both ends are snapped."""
+    x, y, w = mixed
+    a = y[FROM] * w[TO] - w[FROM] * y[TO]
+    b = w[FROM] * x[TO] - x[FROM] * w[TO]
+    c = x[FROM] * y[TO] - y[FROM] * x[TO]
+    return jnp.stack([a, b, c])
+
+
+def signed_area(abc, mixed):
+    return sum(abc[k, 2] * mixed[k, 2] for k in range(3))
+
+
+def integer_edges(abc, mixed, xyr):
+    """Integers [3, 3, n]: a, b, c of edge functions in pixels, as in `windows.edge_functions`, |a| and |b| <= SLOPE."""
+    at = snapped(xyr)
+    both = at[FROM] & at[TO]
+    a, b, c = abc
+    scale = jnp.where(both, 1.0, SLOPE / jnp.maximum(jnp.maximum(jnp.abs(a), jnp.abs(b)), 1e-300))
+    a, b = cast(jnp.rint(a * scale), I64), cast(jnp.rint(b * scale), I64)
+    anchor_x, anchor_y = (cast(jnp.where(at[FROM], t[FROM], t[TO]), I64) for t in (xyr[0], xyr[1]))
+    free = cast(jnp.clip(jnp.rint(c * scale), -(2.0**58), 2.0**58), I64)
+    c = jnp.where(at[FROM] | at[TO], -(a * anchor_x + b * anchor_y), free)
+    sign = jnp.where(signed_area(abc, mixed) < 0, -1, 1)[None] * PARITY[:, None]
+    a, b, c = a * sign, b * sign, c * sign
+    return jnp.stack([a, b, (c - jnp.where(top_left(a, b), 0, 1)) >> SUB])
+
+
+def visible_box(free, depth, xyr, height, width):
+    """First and last pixel column and row that the part in front of the near plane can touch: front corners, and the
+    points where edges cross the plane (those with a pixel's margin)."""
+    front = xyr[0] != BEHIND
+    gap = depth[FROM] - depth[TO]
+    t = jnp.clip(depth[FROM] / jnp.where(gap == 0, 1.0, gap), 0.0, 1.0)
+    cut = free[:, FROM] + t[None] * (free[:, TO] - free[:, FROM])
+    crossing = front[FROM] != front[TO]
+    box = []
+    for k, size in ((0, width), (1, height)):
+        crossed = jnp.clip(cut[k] / jnp.maximum(cut[2], 1e-300), -float(FAR_OFF), float(FAR_OFF))
+        low, high = jnp.full(front.shape[1:], np.inf), jnp.full(front.shape[1:], -np.inf)
+        for corner in range(3):
+            for valid, point, margin in ((front, cast(xyr[k], F64), 0.0), (crossing, crossed, float(ONE))):
+                low = jnp.where(valid[corner], jnp.minimum(low, point[corner] - margin), low)
+                high = jnp.where(valid[corner], jnp.maximum(high, point[corner] + margin), high)
+        box.append(cast(jnp.ceil(jnp.clip(low, 0.0, float(LIMIT)) / ONE), I32))
+        box.append(cast(jnp.floor(jnp.clip(high, -float(ONE), (size - 1.0) * ONE) / ONE), I32))
+    return box
+
+
+def tile_box(points, abc, xyr, even, valid, height, width, cull):
+    """[4, n] int32: first tile column and row, number of columns, number of tiles; none where nothing is drawn."""
+    x0, x1, y0, y1 = visible_box(points[:3], points[7], xyr, height, width)
+    area = signed_area(abc, points[3:6])
+    finite = jnp.isfinite(jnp.sum(points, axis=(0, 1)))
     drawn = valid & finite & faces_viewer(jnp.where(even, area, -area), cull) & (x1 >= x0) & (y1 >= y0)
-    return edges, (plane, lowest, highest, bound), tx, ty, columns, jnp.where(drawn, columns * rows, 0)
+    tx, ty = x0 >> BITS, y0 >> BITS
+    columns, rows = (x1 >> BITS) - tx + 1, (y1 >> BITS) - ty + 1
+    return jnp.stack([tx, ty, columns, jnp.where(drawn, columns * rows, 0)])
 
 
-def draw_large(
-    keys, rank, total, words, ends, corners, faces, vertices, m, near, shift, *, height, width, cull, stride
-):
-    """The faces number `rank` [n] of the large class, drawn into the keys, PAIRS tiles at a time."""
-    x, y, r = corners
-    some = total > 0
-    last = faces[0].shape[0] - 1
+def nearness_lines(points, abc):
+    """Float64 [3, n]: the nearness as a function a x + b y + c of window coordinates."""
+    area = signed_area(abc, points[3:6])
+    weight = points[6] * PARITY[:, None] / jnp.where(area == 0, 1.0, area)[None]
+    return sum(abc[:, k] * weight[k][None] for k in range(3))
 
-    def find(rank, words, ends):
-        return jnp.minimum(select(words, ends, jnp.minimum(rank, total - 1)), last)
 
-    def setup(face, rank, vertices, m, near, shift):
-        index = corner_indices(faces, face)
-        tx, ty, tr = ([take(plane, i) for i in index] for plane in (x, y, r))
-        position = [take(vertices, i) for i in index]
-        return large_setup(
-            position,
-            tx,
-            ty,
-            tr,
-            is_even(faces, face),
-            rank < total,
-            m,
-            near,
-            shift,
-            height=height,
-            width=width,
-            cull=cull,
-        )
+def nearness_range(xyr, near, shift):
+    """Float32 [3, n]: least and greatest nearness of the visible part, and the bound where the near plane cuts."""
+    front = xyr[0] != BEHIND
+    r = cast(nearness(xyr[2]) - shift, F32)
+    whole = front[0] & front[1] & front[2]
+    limit = cast(near - shift, F32)
+    lowest = three(jnp.minimum, jnp.where(front, r, np.float32(np.inf)))
+    highest = jnp.where(whole, three(jnp.maximum, r), limit)
+    return jnp.stack([lowest, highest, jnp.where(whole, np.float32(np.inf), limit)])
 
-    face = stored(some, find, rank, words, ends)
-    edges, (plane, lowest, highest, bound), tx, ty, columns, count = stored(
-        some, setup, face, rank, vertices, m, near, shift
-    )
-    tile_ends = jnp.cumsum(count)
-    tiles = tile_ends[-1]
-    bits = TILE.bit_length() - 1
+
+def draw_tiles(keys, vertices, face, index, xyr, even, valid, m, near, shift, *, height, width, cull, stride):
+    """Faces [n] with corner indices [3, n] (ascending) and corners xyr [3, 3, n], drawn into the keys."""
+    always = vertices[0, 0] == vertices[0, 0]
+    m, wide_near, wide_shift = cast(m, F64), cast(near, F64), cast(shift, F64)
+
+    def points(index, xyr, m, near, shift):
+        position = take(vertices.reshape(-1), index[None] * 3 + np.arange(3, dtype=np.int32)[:, None, None])
+        return homogeneous(cast(position, F64), xyr, m, near, shift, height, width)
+
+    point = stored(always, points, index, xyr, m, wide_near, wide_shift)
+    abc = stored(always, lines, point[3:6])
+    edges = stored(always, integer_edges, abc, point[3:6], xyr)
+    box = stored(always, lambda *t: tile_box(*t, height, width, cull), point, abc, xyr, even, valid)
+    plane = stored(always, nearness_lines, point, abc)
+    limits = stored(always, nearness_range, xyr, near, shift)
+    ends = jnp.cumsum(box[3], dtype=jnp.int32)
+    tiles = ends[-1]
 
     def locate(pair):
+        """The pair's face, and its tile's first pixel."""
         pair = jnp.minimum(pair, tiles - 1)
-        t = lower_bound(tile_ends, pair)
-        k = pair - (take(tile_ends, t) - take(count, t))
-        across = jnp.maximum(take(columns, t), 1)
-        row = k // across
-        ox, oy = (take(tx, t) + (k - row * across)) << bits, (take(ty, t) + row) << bits
-        return t, jnp.clip(ox, 0, width - 1), jnp.clip(oy, 0, height - 1)
+        t = jnp.sum(ends[:, None] <= pair[None], axis=0, dtype=jnp.int32)
+        tx, ty, columns, count = (take(b, t) for b in box)
+        k = pair - (take(ends, t) - count)
+        row = k // jnp.maximum(columns, 1)
+        ox, oy = (tx + (k - row * columns)) << BITS, (ty + row) << BITS
+        return jnp.stack([t, jnp.clip(ox, 0, width - 1), jnp.clip(oy, 0, height - 1)])
 
-    def tile(t, ox, oy, pair):
-        wide_x, wide_y = cast(ox, I64), cast(oy, I64)
-        local = []
-        for k in range(3):
-            a, b, c = (take(e, t) for e in edges[k])
-            # within the tile |a dx + b dy| < 2^30: what is further from zero than that keeps its sign
-            at = jnp.clip(a * wide_x + b * wide_y + c, -(1 << 30), 1 << 30)
-            local.append([cast(v, I32) for v in (a, b, at)])
-        local[0][2] = jnp.where(pair < tiles, local[0][2], -(1 << 30))
-        gx, gy, base = (take(v, t) for v in plane)
-        start = base + gx * cast(wide_x << SUB, F64) + gy * cast(wide_y << SUB, F64)
-        slope = [cast(v, jnp.float32) for v in (start, gx * ONE, gy * ONE)]
-        clamp = [take(v, t) for v in (lowest, highest, bound)]
-        return local, slope + clamp, ~cast(take(face, t), jnp.uint32), oy * stride + ox
+    def local_edges(at, pair):
+        a, b, c = (take(e.T, at[0]).T for e in edges)
+        c = jnp.clip(a * cast(at[1], I64)[None] + b * cast(at[2], I64)[None] + c, -LIMIT, LIMIT)
+        c = jnp.where((pair < tiles)[None], c, -LIMIT)
+        return cast(jnp.stack([a, b, c]), I32)
+
+    def local_plane(at):
+        gx, gy, base = (take(p, at[0]) for p in plane)
+        start = base + gx * cast(at[1] << SUB, F64) + gy * cast(at[2] << SUB, F64)
+        slope = cast(jnp.stack([start, gx * ONE, gy * ONE]), F32)
+        return jnp.concatenate([slope, jnp.stack([take(t, at[0]) for t in limits])])
 
     def step(state):
         j, keys = state
         pair = j * PAIRS + lax.iota(jnp.int32, PAIRS)
-        t, ox, oy = stored(tiles > 0, locate, pair)
-        local, slope, low, first = stored(tiles > 0, tile, t, ox, oy, pair)
-        return j + 1, merge(keys, window_keys(local, slope, low, TILE, TILE), first, stride)
+        at = stored(always, locate, pair)
+        local = stored(always, local_edges, at, pair)
+        slope = stored(always, local_plane, at)
+        low = ~cast(take(face, at[0]), jnp.uint32)
+        return j + 1, merge(keys, window_keys(local, slope, low, TILE, TILE), at[2] * stride + at[1], stride)
 
     return lax.while_loop(lambda state: state[0] * PAIRS < tiles, step, (jnp.int32(0), keys))[1]

@@ -15,15 +15,24 @@ import numpy as np
 from jax import lax
 
 from shapeenh import checks
-from shapeenh.buffers.bins import WINDOWS, bit_counts, class_words, classify
+from shapeenh.buffers.bins import WINDOWS, ascending, bin_faces, corner_indices, select
 from shapeenh.buffers.inputs import check_camera, check_mesh
-from shapeenh.buffers.project import clip_matrix, nearness_shift, project
-from shapeenh.buffers.tiles import FACES, TILE, draw_large
-from shapeenh.buffers.windows import draw_small
+from shapeenh.buffers.project import SUB, clip_matrix, nearness, nearness_shift, project
+from shapeenh.buffers.tiles import FACES, TILE, draw_tiles
+from shapeenh.buffers.windows import (
+    edge_functions,
+    merge,
+    merge_pixels,
+    nearness_plane,
+    pixel_keys,
+    window_keys,
+    window_origin,
+)
 from shapeenh.buffers.xla import stored, take
 from shapeenh.types import Camera, Mesh, Visibility
 
-SLOTS = 65536  # candidate pixels per step of a small class
+CHUNK = 4096  # faces per step
+SLOTS = 65536  # candidate pixels per step
 CULL = {False: "none", None: "none", "none": "none", True: "back", "back": "back", "front": "front"}
 
 
@@ -75,58 +84,81 @@ def visible_triangles(vertices, faces, view, projection, *, height, width, cull)
 
 def draw(vertices, faces, m, near, height, width, cull):
     count = faces.shape[0]
-    classes = len(WINDOWS) + 1
-    planes = [faces[:, k] for k in range(3)]
+    always = faces[0, 0] >= np.iinfo(np.int32).min
+    flat_faces = faces.reshape(-1)
     with jax.enable_x64(True):  # 64-bit keys, whatever the caller's precision
-        always = planes[0][0] >= np.iinfo(np.int32).min
-        x, y, r, seen = stored(always, lambda v, m: project(v, m, near, height, width), vertices, m)
-        shift = nearness_shift(r, seen)
-
-        def kinds(x, y, planes):
-            tx, ty = ([take(t, i) for i in planes] for t in (x, y))
-            return classify(tx, ty, height, width, cull)
-
-        kind = stored(always, kinds, x, y, planes)
-        words = stored(always, lambda kind: class_words(kind, classes), kind)
-        ends = bit_counts(words)
+        corners = stored(always, lambda v, m, near: project(v, m, near, height, width), vertices, m, near)
+        shift = nearness_shift(corners)
+        words, ends = bin_faces(always, faces, corners, height, width, cull)
         totals = ends[:, -1]
+        flat_words, flat_ends, flat_corners = words.reshape(-1), ends.reshape(-1), corners.reshape(-1)
 
-        border = max(
-            [TILE] + [k for window in WINDOWS for k in window]
-        )  # windows may hang over the right and lower edge
+        border = max([TILE] + [k for window in WINDOWS for k in window])  # windows may hang over the lower right edge
         stride = width + border
-        keys = jnp.zeros(((height + border) * stride,), jnp.uint64)
+        chunk = min(CHUNK, -(-count // 256) * 256)
+        steps = jnp.cumsum((totals + (chunk - 1)) // chunk, dtype=jnp.int32)
 
-        for k, window in enumerate(WINDOWS):
-            chunk = min(int(np.clip(SLOTS // (window[0] * window[1]), 1024, 8192)), -(-count // 256) * 256)
+        faces_at_once = max(1, min(FACES, (2**31 - 1) // (-(-height // TILE) * -(-width // TILE))))  # counts fit int32
 
-            def small(state, k=k, window=window, chunk=chunk):
-                i, keys = state
-                rank = i * chunk + lax.iota(jnp.int32, chunk)
-                corners = (x, y, r)
-                return i + 1, draw_small(
-                    keys, rank, totals[k], words[k], ends[k], corners, shift, planes,
-                    height=height, width=width, window=window, stride=stride,
-                )  # fmt: skip
-
-            def more(state, k=k, chunk=chunk):
-                return state[0] * chunk < totals[k]
-
-            keys = lax.while_loop(more, small, (jnp.int32(0), keys))[1]
-
-        step = max(1, min(FACES, (2**31 - 1) // (-(-height // TILE) * -(-width // TILE))))  # tile counts fit int32
-        total = totals[-1]
-
-        def large(state):
+        def step(state):
             i, keys = state
-            rank = i * step + lax.iota(jnp.int32, step)
-            return i + 1, draw_large(
-                keys, rank, total, words[-1], ends[-1], (x, y, r), planes, vertices, m, near, shift,
-                height=height, width=width, cull=cull, stride=stride,
-            )  # fmt: skip
+            row = jnp.sum(i >= steps, dtype=jnp.int32)
+            total = totals[row]
+            rank = (i - jnp.where(row > 0, steps[row - 1], 0)) * chunk + lax.iota(jnp.int32, chunk)
 
-        keys = lax.while_loop(lambda state: state[0] * step < total, large, (jnp.int32(0), keys))[1]
+            def find(rank):
+                return select(flat_words, flat_ends, row, jnp.minimum(rank, total - 1), count)
 
+            face = stored(always, find, rank)
+
+            def fetch(face):
+                index, even = ascending(corner_indices(flat_faces, face))
+                part = np.arange(3, dtype=np.int32)[:, None, None] * vertices.shape[0]
+                return take(flat_corners, index[None] + part), index, even
+
+            xyr, index, even = stored(always, fetch, face)
+            valid = rank < total
+
+            def setup(xyr, valid):
+                origin = jnp.stack(window_origin(xyr[0], xyr[1], height, width))
+                x, y = xyr[0] - (origin[0] << SUB)[None], xyr[1] - (origin[1] << SUB)[None]
+                edges = edge_functions(x, y, valid).reshape(9, -1).astype(jnp.float32)
+                plane = nearness_plane(x, y, nearness(xyr[2]) - shift)
+                return jnp.concatenate([edges, plane]), origin[1] * stride + origin[0]
+
+            planes, first = stored(always, setup, xyr, valid)
+            # one loop per class, of which all but one take no step: unlike a conditional, a loop updates in place
+            for k, (rows, columns) in enumerate(WINDOWS):
+                part = min(chunk // 2, SLOTS // (rows * columns))
+
+                def draw_part(j, keys, rows=rows, columns=columns, part=part):
+                    def cut(*tables):
+                        return [lax.dynamic_slice_in_dim(t, j * part, part, -1) for t in tables]
+
+                    both, low, start = stored(always, cut, planes, ~face.astype(jnp.uint32), first)
+                    edges, plane = both[:9].reshape(3, 3, -1), both[9:]
+                    if rows * columns <= 4:
+                        new = stored(always, lambda *t: pixel_keys(*t, rows, columns), edges, plane, low)
+                        return merge_pixels(keys, new, start, stride, columns)
+                    return merge(keys, window_keys(edges, plane, low, rows, columns), start, stride)
+
+                parts = jnp.where(row == k, (jnp.minimum(total - rank[0], chunk) + (part - 1)) // part, 0)
+                keys = lax.fori_loop(jnp.int32(0), parts, draw_part, keys)
+
+            part = min(chunk // 2, faces_at_once)
+
+            def draw_large(j, keys):
+                cut = [lax.dynamic_slice_in_dim(t, j * part, part, -1) for t in (face, index, xyr, even, valid)]
+                return draw_tiles(
+                    keys, vertices, *cut, m, near, shift, height=height, width=width, cull=cull, stride=stride
+                )
+
+            parts = jnp.where(row == len(WINDOWS), (jnp.minimum(total - rank[0], chunk) + (part - 1)) // part, 0)
+            keys = lax.fori_loop(jnp.int32(0), parts, draw_large, keys)
+            return i + 1, keys
+
+        keys = jnp.zeros(((height + border) * stride,), jnp.uint64)
+        keys = lax.while_loop(lambda state: state[0] < steps[-1], step, (jnp.int32(0), keys))[1]
         keys = keys.reshape(height + border, stride)[:height, :width]
         face = lax.bitcast_convert_type(~lax.convert_element_type(keys, jnp.uint32), jnp.int32)
         return jnp.where(keys == 0, jnp.int32(-1), face)

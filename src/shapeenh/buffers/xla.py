@@ -30,16 +30,17 @@ def stored(always, function, *args):
     return lax.cond(always, function, never, *args)
 
 
-def lower_bound(ends, rank):
-    """The first i with ends[i] > rank, for ascending `ends`; a branchless bisection, all ranks at once."""
-    n = ends.shape[0]
-    low = jnp.zeros(rank.shape, jnp.int32)
-    step = 1
-    while step < n:
-        step *= 2
-    while step >= 1:
+def lower_bound(ends, first, count, rank):
+    """The first i < count with ends[first + i] > rank, for an ascending stretch of `ends`; a branchless bisection,
+    all ranks at once."""
+    top = 1 << max(count - 1, 0).bit_length()
+
+    def halve(_, state):
+        low, step = state
         middle = low + (step - 1)
-        go = (middle < n) & (take(ends, jnp.minimum(middle, n - 1)) <= rank)
-        low = jnp.where(go, low + step, low)
-        step //= 2
-    return jnp.minimum(low, n - 1)
+        go = (middle < count) & (take(ends, first + jnp.minimum(middle, count - 1)) <= rank)
+        return jnp.where(go, low + step, low), step >> 1
+
+    state = jnp.zeros(rank.shape, jnp.int32), jnp.int32(top)
+    low = lax.fori_loop(jnp.int32(0), jnp.int32(top.bit_length()), halve, state)[0]
+    return jnp.minimum(low, count - 1)
