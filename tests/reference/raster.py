@@ -104,3 +104,17 @@ def cut_face(p, clip, height, width, cull):
     margin = (distance > -1 / 64).all(-1) & (total > -1e-9) & (nearness <= 2 + 1e-5)
     sure = (distance > 1 / 64).all(-1) & (total > 0) & (nearness <= 2 - 1e-5)
     return inside, margin & ~sure, nearness
+
+
+def interpolate(attribute, vertices, faces, view, projection, triangle):
+    """Perspective-correct values [H, W, C] and weights [H, W, 3]: at each pixel, one 3 x 3 system."""
+    height, width = triangle.shape
+    clip = clip_coordinates(vertices, view, projection)
+    out, weights = np.zeros((height, width, np.shape(attribute)[1])), np.zeros((height, width, 3))
+    for y, x in zip(*np.nonzero(triangle >= 0), strict=True):
+        face = np.asarray(faces)[triangle[y, x]]
+        corners = clip[face][:, [0, 1, 3]].T
+        beta = np.linalg.solve(corners, [(x + 0.5) * 2 / width - 1, 1 - (y + 0.5) * 2 / height, 1.0])
+        weights[y, x] = beta / beta.sum()
+        out[y, x] = weights[y, x] @ np.asarray(attribute, np.float64)[face]
+    return out, weights
