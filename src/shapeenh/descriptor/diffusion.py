@@ -2,23 +2,27 @@
 
 The semi-discrete operator is A g (p) = sum over the four neighbours q of l_pq (g_q - g_p), with the links l_pq of
 `stencils.links`. A is symmetric, its rows and columns sum to 0, its off-diagonal entries are not negative: hence the
-three laws (nothing crosses a closed link, the sum over a connected region stays, no new extrema).
+three laws (nothing crosses a closed link, the sum over a connected region stays, no new extrema). Both schemes below
+are made of averages with non-negative weights alone, and so keep them, step for step.
 
-Planes are `[C, H, W]`. Imports `numerics`, `checks` and `stencils` only.
+Planes are `[C, H, W]`. Imports `stencils` only.
 """
 
 from __future__ import annotations
 
+import math
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from shapeenh.stencils import shift, stored
+
 # ------------------------------------------------------------------------------------------- the operator
 
+GREATEST_SIGMA = 100.0
 STEP = 0.2  # at 1/4 a checkerboard would keep its amplitude (SPEC 3.5)
-_SLOTS = 8  # states kept per level of the reverse sweep
 
 
 def _jumps(planes):
@@ -37,94 +41,284 @@ def divergence(planes, link_x, link_y):
 # ------------------------------------------------------------------------------------------- explicit steps
 
 
-def _share(budget, k):
-    """How much of its time budget ([1, 1] or [H, W]) a pixel spends in step k: a full step, a short last one, or 0."""
-    return jnp.clip(budget - k * STEP, 0, STEP)
+def _share(budget, k, step):
+    """How much of its time budget a pixel spends in step k: a full step, a short last one, or 0."""
+    return jnp.clip(budget - k * step, 0, step)
 
 
-def _steps(budget):
-    return jnp.ceil(jnp.max(budget) / STEP - 1e-6).astype(jnp.int32)
+def _count(budget, step):
+    return jnp.ceil(jnp.max(budget) / step - 1e-6).astype(jnp.int32)
 
 
-def _forward(start, stop, planes, link_x, link_y, budget):
-    def step(k, g):
-        return g + _share(budget, k)[None] * divergence(g, link_x, link_y)
+def _forward(start, stop, planes, link_x, link_y, budget, weight, step):
+    def one(k, g):
+        return g + (_share(budget, k, step) * weight)[None] * divergence(g, link_x, link_y)
 
-    return lax.fori_loop(start, stop, step, planes)
+    return lax.fori_loop(start, stop, one, planes)
 
 
-@jax.custom_vjp
-def explicit(planes, link_x, link_y, budget):
-    """`planes` after each pixel has spent its time `budget` in explicit steps of at most 1/5 (SPEC 3.5, 3.6).
+@partial(jax.custom_vjp, nondiff_argnums=(5, 6))
+def explicit(planes, link_x, link_y, budget, weight, step=STEP, slots=(8, 8, 8, 8, 8)):
+    """`planes` after each pixel has spent its time `budget` in explicit steps (SPEC 3.5, 3.6).
 
+    planes: [C, H, W]; link_x: [H, W-1]; link_y: [H-1, W]; budget: [1, 1] or [H, W], time in px^2, sigma = sqrt(2 time).
+    weight: [1, 1] or [H, W], what a pixel makes of one unit of inflow (1, or 1/volume); no gradient.
+    *Static*: step, the longest step; slots, how many states the reverse sweep keeps per level, coarsest first: their
+        product bounds the number of steps that can be differentiated.
     The number of steps is read at run time, so nothing recompiles when the budget changes; the last step is as
     short as it has to be, so the result is continuous in the budget.
     """
-    return _forward(0, _steps(budget), planes, link_x, link_y, budget)
+    return _forward(0, _count(budget, step), planes, link_x, link_y, budget, weight, step)
 
 
-def _explicit_fwd(planes, link_x, link_y, budget):
-    return explicit(planes, link_x, link_y, budget), (planes, link_x, link_y, budget)
+def _explicit_fwd(planes, link_x, link_y, budget, weight, step, slots):
+    fixed = (link_x, link_y, budget, weight)
+    return _forward(0, _count(budget, step), planes, *fixed, step), (planes, fixed)
 
 
-def _explicit_bwd(saved, cotangent):
+def _explicit_bwd(step, slots, saved, cotangent):
     """Reverse mode without storing every step.
 
     A is symmetric, so the cotangent is pulled back by the same operator: lam <- lam + A (dt lam). The derivative with
     respect to a link is -jump(dt lam) jump(g), and to a pixel's budget lam (A g), summed over the steps; they need g at
     every step, which is recomputed from kept states.
     """
-    planes, link_x, link_y, budget = saved
+    planes, fixed = saved
+    link_x, link_y, budget, weight = fixed
     zero = (jnp.zeros_like(link_x), jnp.zeros_like(link_y), jnp.zeros_like(budget))
-    carry = _reverse(0, _steps(budget), planes, (cotangent, zero), link_x, link_y, budget, level=4)
-    lam, (d_x, d_y, d_budget) = carry
-    return lam, d_x, d_y, d_budget
+    lam, sums = _reverse(0, _count(budget, step), planes, (cotangent, zero), fixed, step, slots)
+    return lam, *sums, jnp.zeros_like(weight)
 
 
-def _reverse_step(k, g, carry, link_x, link_y, budget):
+def _reverse_step(k, g, carry, fixed, step):
+    link_x, link_y, budget, weight = fixed
     lam, (d_x, d_y, d_budget) = carry
-    share = _share(budget, k)[None]
-    pulled = share * lam
+    pulled = (_share(budget, k, step) * weight)[None] * lam
     lam_x, lam_y = _jumps(pulled)
     g_x, g_y = _jumps(g)
-    partial_step = (budget - k * STEP > 0) & (budget - k * STEP <= STEP)
-    gain = jnp.where(partial_step, jnp.sum(lam * divergence(g, link_x, link_y), axis=0), 0)
-    if budget.shape == (1, 1):
-        gain = jnp.sum(gain)[None, None]
-    sums = (d_x - jnp.sum(lam_x * g_x, axis=0), d_y - jnp.sum(lam_y * g_y, axis=0), d_budget + gain)
+    short = (budget - k * step > 0) & (budget - k * step <= step)
+
+    def gain():
+        own = jnp.where(short, weight * jnp.sum(lam * divergence(g, link_x, link_y), axis=0), 0)
+        return d_budget + (jnp.sum(own)[None, None] if budget.shape == (1, 1) else own)
+
+    sums = (
+        d_x - jnp.sum(lam_x * g_x, axis=0),
+        d_y - jnp.sum(lam_y * g_y, axis=0),
+        lax.cond(jnp.any(short), gain, lambda: d_budget),
+    )
     return lam + divergence(pulled, link_x, link_y), sums
 
 
-def _reverse(start, count, g, carry, link_x, link_y, budget, *, level: int):
-    """Pull `carry` back through `count` steps that begin at `start` with state `g`; keeps `_SLOTS` states per level."""
-    span = _SLOTS ** (level - 1)
+def _reverse(start, count, g, carry, fixed, step, slots):
+    """Pull `carry` back through `count` steps that begin at `start` with state `g`."""
+    span = math.prod(slots[1:])
+    pieces = (count + span - 1) // span
 
-    def sweep(carry):
-        pieces = (count + span - 1) // span
+    def keep(i, kept):
+        states, g = kept
+        states = lax.dynamic_update_index_in_dim(states, g, i, 0)
+        first = start + i * span
+        return states, _forward(first, first + jnp.where(i + 1 < pieces, span, 0), g, *fixed, step)
 
-        def keep(i, kept):
-            states, g = kept
-            states = lax.dynamic_update_index_in_dim(states, g, i, 0)
-            ahead = jnp.where(i + 1 < pieces, span, 0)
-            first = start + i * span
-            return states, _forward(first, first + ahead, g, link_x, link_y, budget)
+    def back(j, carry):
+        i = pieces - 1 - j
+        first, state = start + i * span, lax.dynamic_index_in_dim(states, i, 0, keepdims=False)
+        if span == 1:
+            return _reverse_step(first, state, carry, fixed, step)
+        return _reverse(first, jnp.minimum(span, count - i * span), state, carry, fixed, step, slots[1:])
 
-        states, _ = lax.fori_loop(0, pieces, keep, (jnp.zeros((_SLOTS, *g.shape), g.dtype), g))
-
-        def back(j, carry):
-            i = pieces - 1 - j
-            first, state = start + i * span, lax.dynamic_index_in_dim(states, i, 0, keepdims=False)
-            if level == 1:
-                return _reverse_step(first, state, carry, link_x, link_y, budget)
-            length = jnp.minimum(span, count - i * span)
-            return _reverse(first, length, state, carry, link_x, link_y, budget, level=level - 1)
-
-        return lax.fori_loop(0, pieces, back, carry)
-
-    if level == 1:
-        return sweep(carry)
-    shallow = partial(_reverse, level=level - 1)
-    return lax.cond(count <= span, lambda c: shallow(start, count, g, c, link_x, link_y, budget), sweep, carry)
+    states, _ = lax.fori_loop(0, pieces, keep, (jnp.zeros((slots[0], *g.shape), g.dtype), g))
+    return lax.fori_loop(0, pieces, back, carry)
 
 
 explicit.defvjp(_explicit_fwd, _explicit_bwd)
+
+
+def slots_for(steps: int, most: int = 8) -> tuple[int, ...]:
+    """`slots` of `explicit` for up to `steps` steps, none above `most`."""
+    depth = 1
+    while most**depth < steps:
+        depth += 1
+    return (max(2, math.ceil(steps ** (1 / depth))),) * depth
+
+
+# ------------------------------------------------------------------------------------------- the fast scheme
+#
+# Once a few explicit steps have removed what is finer than 2 px, blocks of 2 x 2 pixels may stand for their pixels: a
+# step there is four times as long and costs a quarter. So: smooth, average over blocks, go on (recursively) on the
+# blocks, give every pixel its block's value, smooth again, which removes the blocks' edges. All are averages with
+# non-negative weights, and symmetric ones.
+#
+# Where an insulated line cuts through a block, one connected part of its pixels forms the cell; pixels cut off from it
+# join the cell of a neighbouring block that they are linked to, or else keep their value and wait for the smoothing.
+# A cell knows its volume (in pixels) and the length of its open border with the cell to its right and the one below.
+
+_SMOOTHING = (5, 20)  # explicit steps before and after a descent: on pixels; on blocks of any size
+_WORTH = 12  # a descent costs as much as about so many steps
+_LEVELS = 2  # blocks of 4 x 4 pixels: there, even sigma = 100 takes a fraction of the other work
+_STRONG = 0.2  # a border less open than that joins nothing
+
+_CELL, _LEFT, _RIGHT, _UP, _DOWN = 1, 2, 3, 4, 5  # a pixel's role: in its block's cell, or which neighbour's it joins
+_SIDES = ((_LEFT, -1, -1), (_RIGHT, 1, -1), (_UP, -1, -2), (_DOWN, 1, -2))  # (role, step, axis)
+
+
+def _quarters(array):
+    """The four members of every 2 x 2 block: top left, top right, bottom left, bottom right."""
+    return tuple(array[..., i::2, j::2] for i in (0, 1) for j in (0, 1))
+
+
+def _assemble(parts):
+    """Inverse of `_quarters`."""
+    a, b, c, d = parts
+    rows = jnp.stack([jnp.stack([a, b], -1), jnp.stack([c, d], -1)], -3)
+    return rows.reshape(*a.shape[:-2], 2 * a.shape[-2], 2 * a.shape[-1])
+
+
+def _even(array, size):
+    """Zero rows and columns at the bottom and right, up to `size` rounded up to even numbers."""
+    return jnp.pad(
+        array, [(0, 0)] * (array.ndim - 2) + [(0, n + n % 2 - m) for n, m in zip(size, array.shape[-2:], strict=True)]
+    )
+
+
+def _roles(volume, border_x, border_y, spacing):
+    """The role of every pixel, int8; 0 for none. All sizes even."""
+    strong_x, strong_y = border_x >= _STRONG * spacing, border_y >= _STRONG * spacing
+    v = _quarters(volume)
+    top, _, bottom, _ = _quarters(strong_x)
+    left, right, _, _ = _quarters(strong_y)
+
+    # the largest member, the first of several, and all that is linked to it inside the block
+    largest = jnp.maximum(jnp.maximum(v[0], v[1]), jnp.maximum(v[2], v[3]))
+    seed, taken = [], largest <= 0
+    for part in v:
+        seed.append((part == largest) & ~taken)
+        taken = taken | seed[-1]
+    a, b, c, d = seed
+    for _ in range(3):
+        a, b, c, d = (
+            a | b & top | c & left,
+            b | a & top | d & right,
+            c | a & left | d & bottom,
+            d | b & right | c & bottom,
+        )
+    cell = _assemble([part.astype(jnp.int8) for part in (a, b, c, d)])
+
+    # of the others, those linked to the cell of a neighbouring block
+    role = cell
+    for name, step, axis in _SIDES:
+        odd = lax.broadcasted_iota(jnp.int32, volume.shape, axis % 2) % 2
+        strong = strong_x if axis == -1 else strong_y
+        link = strong if step == 1 else shift(strong, -1, axis)
+        joins = (role == 0) & (volume > 0) & (odd == (step == 1)) & link & (shift(cell, step, axis) == _CELL)
+        role = jnp.where(joins, jnp.int8(name), role)
+    return role
+
+
+def _gather(planes, role):
+    """Sums over the cells, `[..., h, w]`, of `[..., 2h, 2w]` planes."""
+    role = role.reshape((1,) * (planes.ndim - 2) + role.shape)
+    total = jnp.where(role == _CELL, planes, 0)
+    for name, step, axis in _SIDES:
+        total = total + shift(jnp.where(role == name, planes, 0), -step, axis)
+    a, b, c, d = _quarters(total)
+    return a + b + c + d
+
+
+def _spread(cells, planes, role):
+    """Every pixel its cell's value; those without one keep that of `planes`."""
+    *lead, h, w = cells.shape
+    blocks = jnp.broadcast_to(cells[..., :, None, :, None], (*lead, h, 2, w, 2)).reshape(*lead, 2 * h, 2 * w)
+    out = jnp.where(role[None] == _CELL, blocks, planes)
+    for name, step, axis in _SIDES:
+        out = jnp.where(role[None] == name, shift(blocks, step, axis), out)
+    return out
+
+
+def _merge(volume, border_x, border_y, role):
+    """Volumes and borders of the cells."""
+    cell = role == _CELL
+    across_x = jnp.where(cell & shift(cell, 1, -1), border_x, 0)[:, 1::2]
+    across_y = jnp.where(cell & shift(cell, 1, -2), border_y, 0)[1::2]
+    return _gather(volume, role), across_x[0::2] + across_x[1::2], across_y[:, 0::2] + across_y[:, 1::2]
+
+
+def _conduct(border, volume, axis: int, spacing, step):
+    """Links between cells: border length over distance, but never so much that a step could overshoot."""
+    least = jnp.minimum(volume, shift(volume, 1, axis))
+    link = jnp.minimum(border / spacing, least * (0.25 / step))
+    return link[:, :-1] if axis == -1 else link[:-1]
+
+
+def _descend(stacks, level: int, time, volume, border_x, border_y, always, levels: int, sure: bool):
+    """Diffuse a tuple of plane stacks on the cells of one level for `time`."""
+    spacing = 2.0**level
+    step = STEP * spacing**2
+    smoothing = step * _SMOOTHING[min(level, 1)]
+    rest = time - 2 * smoothing - 0.25 * spacing**2  # averaging over blocks spreads like a time of h^2 / 4
+    link_x = _conduct(border_x, volume, -1, spacing, step)
+    link_y = _conduct(border_y, volume, -2, spacing, step)
+    if level == 0:
+        weight = jnp.ones((1, 1), volume.dtype)
+    else:
+        link_x, link_y = stored(always, lambda *pair: pair, link_x, link_y)
+        weight = jnp.where(volume > 0, 1 / jnp.maximum(volume, 1), 0)
+
+    def smooth(stacks, time, steps):
+        slots = slots_for(steps, 8 * 4**level)  # coarse states are small
+        return tuple(explicit(planes, link_x, link_y, time, weight, step, slots) for planes in stacks)
+
+    few = 2 * _SMOOTHING[min(level, 1)] + 2 + _WORTH  # not worth a descent
+    if level == levels:
+        return smooth(stacks, time, few if levels < _LEVELS else math.ceil(0.5 * GREATEST_SIGMA**2 / step))
+
+    def coarse(stacks):
+        size = h, w = volume.shape
+        v, bx, by = _even(volume, size), _even(border_x, size), _even(border_y, size)
+        role = stored(always, lambda *a: _roles(*a, spacing), v, bx, by)
+        cells = stored(always, _merge, v, bx, by, role)
+
+        def down(planes, role, v, volume):
+            return _gather(_even(planes, size) * v[None], role) / jnp.where(volume > 0, volume, 1)[None]
+
+        def up(cells, planes, role):
+            return _spread(cells, _even(planes, size), role)[:, :h, :w]
+
+        aside = jnp.full((1, 1), smoothing, volume.dtype)
+        stacks = smooth(stacks, aside, _SMOOTHING[min(level, 1)])
+        lower = tuple(stored(always, down, planes, role, v, cells[0]) for planes in stacks)
+        lower = _descend(lower, level + 1, rest, *cells, always, levels, sure)
+        stacks = tuple(stored(always, up, c, planes, role) for c, planes in zip(lower, stacks, strict=True))
+        return smooth(stacks, aside, _SMOOTHING[min(level, 1)])
+
+    if sure:
+        return coarse(stacks)
+    return lax.cond(rest[0, 0] > _WORTH * step, coarse, lambda stacks: smooth(stacks, time, few), stacks)
+
+
+def diffuse_stacks(stacks, link_x, link_y, budget, alive, always, *, levels: int, sure: bool = False):
+    """A tuple of plane stacks, each diffused for the time `budget`.
+
+    stacks: each [C, H, W]; link_x, link_y, budget: as in `explicit`; alive: [H, W] bool, conductance > 0.
+    always: a true predicate unknown at compile time, for `stored`.
+    *Static*: levels: the fast scheme, for a budget of [1, 1], that merges blocks at most so often (`levels_for(sigma)`
+        or more; exactly that many if `sure`); or -n for explicit steps, at most 8^n where they are differentiated.
+    """
+    if levels < 0:
+        one = jnp.ones((1, 1), link_x.dtype)
+        return tuple(explicit(planes, link_x, link_y, budget, one, STEP, (8,) * -levels) for planes in stacks)
+    border_x, border_y = jnp.pad(link_x, ((0, 0), (0, 1))), jnp.pad(link_y, ((0, 1), (0, 0)))
+    return _descend(stacks, 0, budget, alive.astype(link_x.dtype), border_x, border_y, always, levels, sure)
+
+
+def levels_for(sigma: float) -> int:
+    """How many times `fast` merges blocks for this sigma."""
+    level, rest = 0, 0.5 * sigma * sigma
+    while level < _LEVELS:
+        step = STEP * 4.0**level
+        rest -= 2 * step * _SMOOTHING[min(level, 1)] + 0.25 * 4.0**level
+        if rest <= _WORTH * step:
+            break
+        level += 1
+    return level

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shapeenh.checks import check_range, check_shape, check_type, float_dtype, is_concrete
+from shapeenh.checks import check_choice, check_range, check_shape, check_type, float_dtype, is_concrete
 from shapeenh.descriptor import diffusion, edges, gradient
 from shapeenh.numerics import determinant, eigenvalues, safe_divide, safe_hypot
-from shapeenh.stencils import derivatives, links, stored
+from shapeenh.stencils import derivatives, links, stored, unknown_truth
 from shapeenh.types import Descriptor, GBuffer
 
-GREATEST_SIGMA = 100.0
 CREASE_DEGREES = 40.0
 
 # ------------------------------------------------------------------------------------------- curvatures
@@ -85,7 +85,7 @@ def principal_directions(hessian):
 # ------------------------------------------------------------------------------------------- the descriptor
 
 
-def describe(gbuffer, *, sigma=0.0, foreshortening=1.0, importance=None, creases=False) -> Descriptor:
+def describe(gbuffer, *, sigma=0.0, foreshortening=1.0, importance=None, creases=False, scheme="fast") -> Descriptor:
     """The local shape descriptor: silhouettes, creases, and curvature at a scale of `sigma` pixels (LW09 algorithm 1).
 
     gbuffer: GBuffer. Pixels with a NaN or infinite normal count as off the mask.
@@ -95,7 +95,8 @@ def describe(gbuffer, *, sigma=0.0, foreshortening=1.0, importance=None, creases
         whose count is used up is frozen. With `sigma` > 0 no pixel takes more than `sigma` needs; with `sigma` = 0 the
         counts alone decide.
     creases: False (none computed), True (edges sharper than 40 degrees between pixels), or a threshold in degrees.
-    *Static*: whether `importance` is given and `creases` asked for; a concrete `sigma` of 0 skips the diffusion.
+    scheme: "explicit" (steps of 1/5) or "fast" (the same sigma on a pyramid, to about 1 %; `importance` needs steps).
+    *Static*: scheme; whether `importance` is given and `creases` asked for. A concrete `sigma` = 0 skips the diffusion.
     Returns a Descriptor; all its fields are 0 off the mask.
     *Gradient*: with respect to normals, depth (through the silhouettes' flanks), sigma, foreshortening and importance.
     *Errors*: ValueError for fields whose shapes disagree, and for numbers out of range.
@@ -105,30 +106,44 @@ def describe(gbuffer, *, sigma=0.0, foreshortening=1.0, importance=None, creases
     """
     check_gbuffer(gbuffer)
     shape = gbuffer.mask.shape
-    check_range("sigma", sigma, 0, GREATEST_SIGMA)
+    check_range("sigma", sigma, 0, diffusion.GREATEST_SIGMA)
     check_range("foreshortening", foreshortening, 0, gradient.GREATEST_FORESHORTENING)
     check_shape("sigma", sigma, ())
     check_shape("foreshortening", foreshortening, ())
     if importance is not None:
         check_shape("importance", importance, shape)
-        check_range("importance", importance, 0, 5 * GREATEST_SIGMA**2 / 2)
+        check_range("importance", importance, 0, 5 * diffusion.GREATEST_SIGMA**2 / 2)
+    check_choice("scheme", scheme, ("fast", "explicit"))
     with_creases = creases is not False
     degrees = CREASE_DEGREES if creases is True else creases
     if with_creases:
         check_range("creases", degrees, 0, 180, open_ends=True)
 
     dtype = float_dtype(gbuffer.normal)
-    smooth = importance is not None or not is_concrete(sigma) or bool(np.asarray(sigma) > 0)
     as_float = partial(jnp.asarray, dtype=dtype)
+    smooth = importance is not None or not is_concrete(sigma) or bool(np.asarray(sigma) > 0)
     return _describe(
         gbuffer,
         as_float(sigma),
         None if is_concrete(foreshortening) and np.asarray(foreshortening) == 1 else as_float(foreshortening),
         None if importance is None else as_float(importance),
         as_float(degrees),
-        smooth=smooth,
+        smoothing=_smoothing(sigma, importance, scheme) if smooth else None,
         with_creases=with_creases,
     )
+
+
+def _smoothing(sigma, importance, scheme: str) -> tuple[int, bool]:
+    """`levels` and `sure` of `diffuse_stacks`: all that a sigma decides at compile time."""
+    known = is_concrete(sigma, importance)
+    longest = 0.5 * (float(sigma) if known else diffusion.GREATEST_SIGMA) ** 2
+    if importance is not None or scheme == "explicit":
+        steps = longest / diffusion.STEP
+        if known and importance is not None:
+            most = float(np.max(importance, initial=0))
+            steps = min(steps, most) if steps > 0 else most
+        return -max(1, math.ceil(math.log(max(steps, 1)) / math.log(8) + 1e-6)), True
+    return diffusion.levels_for(float(sigma) if known else diffusion.GREATEST_SIGMA), known
 
 
 def check_gbuffer(gbuffer) -> None:
@@ -143,9 +158,9 @@ def check_gbuffer(gbuffer) -> None:
         check_shape("gbuffer.occlusion", gbuffer.occlusion, (h, w))
 
 
-@partial(jax.jit, static_argnames=("smooth", "with_creases"))
-def _describe(gbuffer, sigma, foreshortening, importance, degrees, *, smooth, with_creases):
-    always = sigma >= 0
+@partial(jax.jit, static_argnames=("smoothing", "with_creases"))
+def _describe(gbuffer, sigma, foreshortening, importance, degrees, *, smoothing, with_creases):
+    always = unknown_truth(gbuffer.normal, gbuffer.position, sigma)
 
     # 1-2: silhouettes and creases
     normal, good = stored(always, gradient.normal_planes, gbuffer)
@@ -159,9 +174,11 @@ def _describe(gbuffer, sigma, foreshortening, importance, degrees, *, smooth, wi
 
     # 4-6: diffusion, of the gradient and of the places where it was measured
     places, bend = None, None
-    if smooth:
+    if smoothing is not None:
         budget = _budget(sigma, importance)
-        g, places = _diffuse(g, link_x, link_y, budget)
+        stacks = (g, _coordinates(g))  # of two planes: four at once overflow the cache
+        levels, sure = smoothing
+        g, places = diffusion.diffuse_stacks(stacks, link_x, link_y, budget, c > 0, always, levels=levels, sure=sure)
         bend = jnp.exp(-8 * jnp.max(budget))  # the fold at the outline is gone within half a pixel
 
     # 7: the Hessian, flat at the singular places
@@ -184,15 +201,13 @@ def _budget(sigma, importance):
     return jnp.where(time > 0, jnp.minimum(counted, time), counted)
 
 
-def _diffuse(g, link_x, link_y, budget):
-    """g, and the pixels' coordinates, diffused alike."""
+def _coordinates(g):
+    """x and y of the pixels, y up, the origin in the middle, as planes `[2, H, W]`."""
     height, width = g.shape[1:]
     x = jnp.arange(width, dtype=g.dtype) - 0.5 * (width - 1)
     y = 0.5 * (height - 1) - jnp.arange(height, dtype=g.dtype)
     shape = (height, width)
-    coordinates = jnp.stack([jnp.broadcast_to(x[None], shape), jnp.broadcast_to(y[:, None], shape)])
-    # two runs of two planes: four at once overflow the cache and take three times as long
-    return tuple(diffusion.explicit(planes, link_x, link_y, budget) for planes in (g, coordinates))
+    return jnp.stack([jnp.broadcast_to(x[None], shape), jnp.broadcast_to(y[:, None], shape)])
 
 
 # Within sigma of an outline the diffused g is an average from one side only and levels off: its plain derivative
