@@ -25,6 +25,8 @@ from shapeenh.io import load_environment, load_image, load_mesh, save_image
 from shapeenh.light.brdf import ashikhmin_shirley
 from shapeenh.light.radiance import shade, shade_warped
 from shapeenh.light.warp import unwarp, warp, warp_jacobian, warp_tensor
+from shapeenh.lines.fields import line_field, make_line_field
+from shapeenh.lines.profile import fit_profile
 from shapeenh.pipeline import enhance, render
 from shapeenh.scene.camera import frame_mesh, orthographic_camera, perspective_camera
 from shapeenh.scene.environment import procedural_sky, procedural_studio, rotate_lights, sample_environment
@@ -75,15 +77,18 @@ __all__ = [
     "estimate_radius",
     "fit_contrast",
     "fit_image",
+    "fit_profile",
     "frame_mesh",
     "gaussian_curvature",
     "gbuffer_from_height",
     "gbuffer_from_normals",
     "gbuffer_from_points",
     "interpolate",
+    "line_field",
     "load_environment",
     "load_image",
     "load_mesh",
+    "make_line_field",
     "make_mesh",
     "mean_curvature",
     "named_material",

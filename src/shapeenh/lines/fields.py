@@ -1,0 +1,314 @@
+"""Height and direction fields whose ridges are feature lines (TH10 7.1 and 7.2.1, table of SPEC 9).
+
+A direction is a line, not an arrow, and is carried as an arrow of twice its angle, (cos 2 phi, sin 2 phi), which is the
+same for theta and -theta: that may be averaged. With the weight |h| it is the traceless part of h theta theta^T.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from shapeenh.checks import check_choice, check_range, check_shape, check_type, float_dtype
+from shapeenh.numerics import eigenvalues, safe_divide, safe_hypot, safe_sqrt, smoothstep
+from shapeenh.stencils import derivatives, links, shift
+from shapeenh.types import Descriptor, GBuffer, LineField
+
+KINDS = ("occlusion", "surface", "luminance", "ridge", "valley", "inflection")
+LEAST_HEIGHT = 1e-5  # slopes and curvatures per px below this are rounding, not shape: no direction there
+GREATEST_SIGMA = 20.0
+_STEP = 0.2  # of an explicit diffusion step (SPEC 3.5)
+
+# ------------------------------------------------------------------------------------------- public
+
+
+def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=1.0) -> LineField:
+    """The field whose ridges are the lines of one kind.
+
+    Source: TH10 table 7.1, 7.2.1; SPEC 9.
+
+    | kind | height | direction |
+    | --- | --- | --- |
+    | occlusion | gradient of depth, with every step of depth counted as 1 | along the gradient |
+    | surface | gradient of the relative depth field | along the gradient |
+    | luminance | gradient of an image | along the gradient |
+    | ridge | greatest curvature of -H: convex | its principal direction |
+    | valley | greatest curvature of H: concave | its principal direction |
+    | inflection | gradient of the mean curvature | along the gradient |
+
+    Args:
+        kind: one of the above.
+        gbuffer: GBuffer; None for luminance without geometry (pictures, video).
+        descriptor: Descriptor of the same image; None for luminance without geometry.
+        luminance: [H, W], for kind "luminance" and no other.
+        sigma: [], px, in [0, 20]: heights and directions are diffused this far, insulated by silhouettes. (Occlusion
+            lines live *on* the silhouettes: they are diffused freely, background included.)
+
+    Static: kind.
+    Returns: LineField [H, W]; 0 off the mask with singularity 1 there, except occlusion lines, which straddle the
+        outline and extend a few pixels beyond it.
+    Gradient: with respect to descriptor.hessian, descriptor.gradient, luminance, sigma, where the height is not 0; none
+        through silhouettes.
+    Errors: ValueError for an unknown kind, for shapes that disagree, and for a missing or superfluous luminance.
+
+    >>> field = se.line_field("valley", gbuffer, se.describe(gbuffer, sigma=2.0))
+    """
+    check_choice("kind", kind, KINDS)
+    check_range("sigma", sigma, 0, GREATEST_SIGMA)
+    check_shape("sigma", sigma, ())
+    if (luminance is not None) != (kind == "luminance"):
+        given = "not given" if luminance is None else "given"
+        raise ValueError(f"luminance is {given} for kind {kind!r}; accepted is an image for 'luminance' and no other")
+    if luminance is not None:
+        check_shape("luminance", luminance, (None, None))
+        luminance = jnp.asarray(luminance, float_dtype(luminance))
+    if kind == "luminance" and gbuffer is None and descriptor is None:
+        dtype = luminance.dtype
+    else:
+        check_type("gbuffer", gbuffer, GBuffer)
+        check_type("descriptor", descriptor, Descriptor)
+        h, w = np.shape(gbuffer.mask)
+        for name, tail in (("hessian", (3,)), ("gradient", (2,)), ("silhouette", ())):
+            check_shape(f"descriptor.{name}", getattr(descriptor, name), (h, w, *tail))
+        check_shape("gbuffer.depth", gbuffer.depth, (h, w))
+        if luminance is not None:
+            check_shape("luminance", luminance, (h, w))
+        dtype = float_dtype(descriptor.hessian)
+    return _line_field(gbuffer, descriptor, luminance, jnp.asarray(sigma, dtype), kind=kind)
+
+
+def make_line_field(height, direction, *, mask=None, silhouette=None, sigma=0.0) -> LineField:
+    """A field from a caller's own heights and directions (TH10 7.2.1, SPEC 9).
+
+    Args:
+        height: [H, W], any unit; lines are its ridges. Where it is not finite it counts as off the mask.
+        direction: [H, W, 2], x right, y up, any length: lines, not arrows; 0 where undefined, which is a singularity.
+        mask: [H, W], nonzero where the fields count; None: everywhere.
+        silhouette: [H, W] in [0, 1], where trajectories must not cross, such as `descriptor.silhouette`; or None.
+        sigma: [], px, in [0, 20], as in `line_field`.
+
+    Static: which arguments are None.
+    Returns: LineField [H, W]. Gradient: with respect to height, direction and sigma.
+    Errors: ValueError for shapes that disagree and numbers out of range.
+    """
+    check_shape("height", height, (None, None))
+    shape = np.shape(height)
+    check_shape("direction", direction, (*shape, 2))
+    for name, image in (("mask", mask), ("silhouette", silhouette)):
+        if image is not None:
+            check_shape(name, image, shape)
+    check_range("sigma", sigma, 0, GREATEST_SIGMA)
+    dtype = float_dtype(height)
+    height, direction = jnp.asarray(height, dtype), jnp.asarray(direction, dtype)
+    mask = jnp.ones(shape, bool) if mask is None else jnp.asarray(mask) != 0
+    silhouette = jnp.zeros(shape, dtype) if silhouette is None else jnp.asarray(silhouette, dtype)
+    return _own_field(height, direction, mask, silhouette, jnp.asarray(sigma, dtype))
+
+
+@partial(jax.jit, static_argnames=("kind",))
+def _line_field(gbuffer, descriptor, luminance, sigma, *, kind) -> LineField:
+    if gbuffer is None:
+        good, silhouette = jnp.isfinite(luminance), jnp.zeros_like(luminance)
+    else:
+        good = gbuffer.mask & jnp.all(jnp.isfinite(descriptor.hessian), axis=-1)
+        silhouette = lax.stop_gradient(jnp.where(good, descriptor.silhouette, 0))
+    if kind == "occlusion":
+        height, double = _occlusion(gbuffer, silhouette)
+        good, silhouette = jnp.ones_like(good), jnp.zeros_like(silhouette)
+    elif kind in ("ridge", "valley"):
+        height, double = _curvature(jnp.where(good[..., None], descriptor.hessian, 0), kind)
+    else:
+        g = _gradient(descriptor, luminance, good, silhouette, kind)
+        height, double = safe_hypot(*g), _doubled(*g)
+    flat = jnp.abs(height) <= LEAST_HEIGHT
+    return _assemble(height, double, good, flat, silhouette, sigma)
+
+
+@jax.jit
+def _own_field(height, direction, mask, silhouette, sigma) -> LineField:
+    good = mask & jnp.isfinite(height) & jnp.all(jnp.isfinite(direction), axis=-1)
+    x, y = (jnp.where(good, direction[..., i], 0) for i in (0, 1))
+    length = safe_hypot(x, y)
+    double = _doubled(safe_divide(x, length), safe_divide(y, length))
+    none = jnp.zeros_like(good)
+    return _assemble(jnp.where(good, height, 0), double, good, none, jnp.clip(silhouette, 0, 1), sigma)
+
+
+# ------------------------------------------------------------------------------------------- table 7.1
+
+
+def _doubled(x, y):
+    """(cos 2 phi, sin 2 phi) of the direction (x, y) as `[2, H, W]`; 0 where it has none."""
+    length = safe_hypot(x, y)
+    x, y = safe_divide(x, length), safe_divide(y, length)
+    return jnp.stack([x * x - y * y, 2 * x * y])
+
+
+def _curvature(hessian, kind):
+    """k_max of -H (ridges) or H (valleys), and its direction: here convexities have negative curvature."""
+    k1, k2 = eigenvalues(hessian)
+    a, b = 0.5 * (hessian[..., 0] - hessian[..., 2]), hessian[..., 1]
+    size = jnp.abs(hessian[..., 0]) + jnp.abs(hessian[..., 2])
+    umbilic = jnp.maximum(jnp.abs(a), jnp.abs(b)) <= jnp.finfo(a.dtype).eps * size  # every direction is principal there
+    r = jnp.where(umbilic, 0, safe_hypot(a, b))
+    double = jnp.stack([safe_divide(a, r), safe_divide(b, r)])
+    return (-k2, -double) if kind == "ridge" else (k1, double)
+
+
+def _gradient(descriptor, luminance, good, silhouette, kind):
+    """(d/dx, d/dy) of what lines of order 1 and 3 are the steepest places of."""
+    if kind == "surface":
+        return tuple(jnp.where(good, descriptor.gradient[..., i], 0) for i in (0, 1))
+    if kind == "luminance":
+        plane = jnp.where(good, luminance, 0)
+    else:
+        plane = jnp.where(good, 0.5 * (descriptor.hessian[..., 0] + descriptor.hessian[..., 2]), 0)
+    link_x, link_y = links(jnp.where(good, 1 - silhouette, 0))
+    d_x, d_y = derivatives(plane[None], link_x, link_y, silhouette[0, 0] >= 0)
+    return d_x[0], d_y[0]
+
+
+def _occlusion(gbuffer, silhouette):
+    """|g_d| and its direction, with every step of depth normalised to 1 and slopes taken off.
+
+    The descriptor marks the far side of a step with a weight; which of its neighbours it is far *of* is read off the
+    depth. Off the mask everything is far.
+    """
+    depth, mask = gbuffer.depth, gbuffer.mask
+    depth = jnp.where(mask & jnp.isfinite(depth), depth, 0)
+
+    def steps(axis):
+        """The signed, normalised step between neighbours along an axis; positive where the second one is farther."""
+        on_a, on_b = (lax.slice_in_dim(mask, i, mask.shape[axis] - 1 + i, axis=axis) for i in (0, 1))
+        a, b = (lax.slice_in_dim(depth, i, mask.shape[axis] - 1 + i, axis=axis) for i in (0, 1))
+        w_a, w_b = (lax.slice_in_dim(silhouette, i, mask.shape[axis] - 1 + i, axis=axis) for i in (0, 1))
+        jump = jnp.where(on_a & on_b, b - a, 0)
+        sign = jnp.sign(jump)
+        # the step that a steep but smooth surface would show anyway: that of the next pair along the line
+        expected = jnp.maximum(jnp.maximum(sign * shift(jump, 1, axis), sign * shift(jump, -1, axis)), 0)
+        excess = jnp.maximum(jnp.abs(jump) - expected, 0)
+        return on_a, on_b, sign, excess, jnp.where(sign > 0, w_b, w_a)
+
+    def padded(plane, axis):
+        """Per pixel, the larger of the values on both of its pairs along an axis."""
+        before, after = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
+        before[axis], after[axis] = (1, 0), (0, 1)
+        return jnp.maximum(jnp.pad(plane, before), jnp.pad(plane, after))
+
+    pairs = [steps(axis) for axis in (0, 1)]
+    largest = jnp.maximum(*(padded(p[3], axis) for axis, p in enumerate(pairs)))
+    planes = []
+    for axis, (on_a, on_b, sign, excess, weight) in enumerate(pairs):
+        top_a, top_b = (lax.slice_in_dim(largest, i, mask.shape[axis] - 1 + i, axis=axis) for i in (0, 1))
+        share = safe_divide(excess, jnp.where(sign > 0, top_b, top_a))
+        inner = sign * weight * smoothstep(0.3, 0.6, share)
+        outer = on_a.astype(inner.dtype) - on_b.astype(inner.dtype)  # +1 where the second one is background
+        step = jnp.where(on_a & on_b, inner, outer)
+        before, after = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
+        before[axis], after[axis] = (1, 0), (0, 1)
+        half = 0.5 * (jnp.pad(step, before) + jnp.pad(step, after))
+        other = 1 - axis
+        planes.append(0.5 * half + 0.25 * (shift(half, 1, other) + shift(half, -1, other)))  # Sobel
+    g_x, g_y = planes[1], -planes[0]
+    return safe_hypot(g_x, g_y), _doubled(g_x, g_y)
+
+
+# ------------------------------------------------------------------------------------------- smoothing, singularities
+
+
+def _assemble(height, double, good, flat, silhouette, sigma) -> LineField:
+    """Diffuse, take directions from doubled angles, find the singularities."""
+    height = jnp.where(good, height, 0)
+    double = jnp.where((good & ~flat)[None], double, 0)
+    weight = jnp.abs(height)
+    planes = jnp.stack([height, weight * double[0], weight * double[1]])
+    link_x, link_y = links(lax.stop_gradient(jnp.where(good, 1 - silhouette, 0)))
+    smooth = diffuse(planes, link_x, link_y, 0.5 * sigma * sigma)
+    # without diffusion the directions are the given ones, also where the height is 0
+    double = jnp.where(sigma > 0, smooth[1:], double)
+    height = jnp.where(good, smooth[0], 0)
+    theta, defined = _halved(double, jnp.where(sigma > 0, 1e-3 * jnp.abs(height), 0.5))
+    theta = jnp.where(good[None], theta, 0)
+    flat &= jnp.abs(height) <= LEAST_HEIGHT
+    theta = jnp.where(flat[None], 0, theta)
+    gamma = jnp.maximum(_angular(theta, good, flat, silhouette), silhouette)
+    gamma = jnp.where(good, jnp.where(flat, silhouette, jnp.where(defined, gamma, 1)), 1)
+    return LineField(height=height, direction=jnp.moveaxis(theta, 0, -1), singularity=gamma)
+
+
+def _halved(double, least):
+    """(unit direction [2, H, W] of half the angle, whether it is defined); 0 where |double| <= least."""
+    length = safe_hypot(double[0], double[1])
+    defined = length > least
+    c, s = (jnp.where(defined, d, 0) / jnp.where(defined, length, 1) for d in double)
+    # (1 + c, s) or (s, 1 - c), whichever does not vanish
+    right = c >= 0
+    big = safe_sqrt(0.5 * (1 + jnp.where(right, c, -c)))
+    small = 0.5 * s / big
+    x, y = jnp.where(right, big, small), jnp.where(right, small, big)
+    return jnp.where(defined[None], jnp.stack([x, y]), 0), defined
+
+
+def _angular(theta, good, flat, silhouette):
+    """gamma_theta = 1 - mean over 8 neighbours |theta . theta_i| (TH10 7.2.1).
+
+    The mean is over those neighbours on the same surface that are not flat: what lies across a silhouette or has no
+    relief says nothing about directions here. Without any it is 1.
+    """
+    weight = jnp.where(good & ~flat, 1 - silhouette, 0)
+    total, cosines = jnp.zeros_like(weight), jnp.zeros_like(weight)
+    for dr, dc in ((r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)):
+        there = lambda plane: shift(shift(plane, dr, 0), dc, 1)  # noqa: E731, B023
+        w = there(weight)
+        total += w
+        cosines += w * jnp.abs(theta[0] * there(theta[0]) + theta[1] * there(theta[1]))
+    return jnp.clip(1 - safe_divide(cosines, total), 0, 1)
+
+
+# ------------------------------------------------------------------------------------------- insulated diffusion
+
+
+def _divergence(planes, link_x, link_y):
+    flow_x = jnp.pad(link_x[None] * (planes[:, :, 1:] - planes[:, :, :-1]), ((0, 0), (0, 0), (1, 1)))
+    flow_y = jnp.pad(link_y[None] * (planes[:, 1:] - planes[:, :-1]), ((0, 0), (1, 1), (0, 0)))
+    return flow_x[:, :, 1:] - flow_x[:, :, :-1] + flow_y[:, 1:] - flow_y[:, :-1]
+
+
+def _steps(planes, link_x, link_y, time):
+    def one(k, g):
+        return g + jnp.clip(time - k * _STEP, 0, _STEP) * _divergence(g, link_x, link_y)
+
+    return lax.fori_loop(0, jnp.ceil(time / _STEP - 1e-6).astype(jnp.int32), one, planes)
+
+
+@jax.custom_vjp
+def diffuse(planes, link_x, link_y, time):
+    """`[C, H, W]` planes after explicit steps of dg/ds = div(c grad g) for `time` = sigma^2/2 (SPEC 3.5).
+
+    Links are those of `stencils.links`. Gradient: with respect to planes and time; none with respect to the links.
+    """
+    return _steps(planes, link_x, link_y, time)
+
+
+def _diffuse_fwd(planes, link_x, link_y, time):
+    return _steps(planes, link_x, link_y, time), (planes, link_x, link_y, time)
+
+
+def _diffuse_bwd(saved, cotangent):
+    """The steps are polynomials of one symmetric matrix: the whole is its own adjoint. `time` moves the last step."""
+    planes, link_x, link_y, time = saved
+    whole = jnp.maximum(jnp.ceil(time / _STEP - 1e-6) - 1, 0) * _STEP
+    last = _divergence(_steps(planes, link_x, link_y, whole), link_x, link_y)
+    return (
+        _steps(cotangent, link_x, link_y, time),
+        jnp.zeros_like(link_x),
+        jnp.zeros_like(link_y),
+        jnp.sum(cotangent * last),
+    )
+
+
+diffuse.defvjp(_diffuse_fwd, _diffuse_bwd)

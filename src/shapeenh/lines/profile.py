@@ -1,0 +1,288 @@
+"""The height profile across the feature line that lies nearest to each pixel (TH10 7.2.2 and 7.2.3, SPEC 9).
+
+A pixel x reads 2k + 1 heights on the straight line x + t theta(x), and a cubic is fitted to them. Where the cubic has a
+maximum there is the skeleton; how far it is, how high, and how sharply curved, is all that brushes need to know.
+No eigenvectors, no systems to solve per pixel: the least-squares matrix is one constant.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from shapeenh.checks import check_choice, check_range, check_shape, check_size, check_type, float_dtype, is_concrete
+from shapeenh.numerics import normalize, smoothstep
+from shapeenh.types import LineField, Profile
+
+GAMMA_MAX = 1.0  # the accumulated singularity that ends a trajectory (TH10 7.2.2)
+LEAST_REACH = 1.0  # px: a neighbourhood narrower than this shows no neighbour on either side, hence no profile
+_OVERSHOOT = 1.8  # a cubic fitted to heights within [0, 1] stays below this between its samples (5 to 65 of them)
+_CHUNK = 1 << 13
+
+
+def fit_profile(field, *, radius: float = 4.0, samples: int = 9, least=0.0) -> Profile:
+    """The distance to the nearest skeleton along the direction field, and the profile's height and curvature there.
+
+    Source: TH10 7.2.2, 7.2.3; SPEC 9.2 to 9.4. The neighbourhood of a pixel shrinks, alike on both sides, so that it
+    ends where the singularity accumulated outwards reaches 1. A cubic is fitted to the heights, and its *maximum* is
+    the skeleton; there is none where the cubic has no maximum within the neighbourhood, where less than 1 px of it is
+    left, or where all that varies is rounding.
+
+    Args:
+        field: LineField [H, W]. Pixels whose height or direction is not finite are singular; where the direction is 0
+            there is no line. Reversing directions, pixel by pixel, only reverses the sign of `distance`.
+        radius: px, in [1, 32], half the length of a neighbourhood.
+        samples: heights read along it, odd, 5 to 65.
+        least: [], finite or -inf; profiles that are not higher are no lines. What can be no higher is not looked at, so
+            a threshold makes the fit as cheap as the lines are few.
+
+    Static: radius, samples.
+    Returns: Profile [H, W]; all fields are 0, and `valid` False, where no skeleton was found.
+    Gradient: with respect to height, direction and singularity, finite everywhere; 0 where not valid. None through
+        which pixels are valid.
+    Errors: ValueError for fields whose shapes disagree, and for numbers out of range.
+
+    >>> profile = se.fit_profile(se.line_field("ridge", gbuffer, descriptor))
+    >>> skeleton = profile.valid & (abs(profile.distance) < 0.5)
+    """
+    check_type("field", field, LineField)
+    check_shape("field.height", field.height, (None, None))
+    h, w = np.shape(field.height)
+    check_shape("field.direction", field.direction, (h, w, 2))
+    check_shape("field.singularity", field.singularity, (h, w))
+    if not is_concrete(radius):
+        raise ValueError("radius is a traced value; accepted is a Python number, since it decides the number of steps")
+    check_range("radius", radius, 1, 32)
+    samples = check_size("samples", samples, low=5, high=65)
+    check_choice("samples % 2", samples % 2, (1,))
+    check_shape("least", least, ())
+    if is_concrete(least) and (np.isnan(least) or least == np.inf):
+        raise ValueError(f"least is {least}; accepted are finite numbers and -inf")
+    dtype = float_dtype(field.height)
+    least = jnp.asarray(least, dtype)
+    options = {"radius": float(radius), "samples": samples}
+    if h == 0 or w == 0:
+        raise ValueError(f"field.height has shape {(h, w)}; accepted are images of at least one pixel")
+    if not is_concrete(field, least):
+        return _fit_everywhere(field, least, **options)
+    planes, candidates = _prepare(field, least, radius=float(radius))
+    index = np.flatnonzero(np.asarray(candidates))
+    listed = np.zeros(_CHUNK * (h * w // _CHUNK + 1), np.int32)  # one size per image: nothing recompiles
+    listed[: index.size] = index
+    return _fit_listed(planes, jnp.asarray(listed), jnp.asarray(index.size, jnp.int32), least, **options)
+
+
+@partial(jax.jit, static_argnames=("radius", "samples"))
+def _fit_everywhere(field, least, *, radius, samples) -> Profile:
+    planes = _planes(field)
+    h, w = planes[2].shape
+    row = jnp.broadcast_to(lax.iota(jnp.int32, h)[:, None], (h, w))
+    col = jnp.broadcast_to(lax.iota(jnp.int32, w)[None, :], (h, w))
+    theta = planes[2], planes[3]
+    return Profile(*_fit(planes, row, col, *theta, least, radius=radius, samples=samples))
+
+
+@partial(jax.jit, static_argnames=("radius",))
+def _prepare(field, least, *, radius):
+    """(planes, where a profile higher than `least` is possible [H, W] bool)."""
+    planes = _planes(field)
+    h, w = planes[2].shape
+    # A sample lies within ceil(radius) pixels of its pixel, and is read from the four pixels around it.
+    highest = _box(jnp.maximum, planes[0], int(np.ceil(radius)), h, w)
+    lowest = _box(jnp.minimum, planes[0], int(np.ceil(radius)), h, w)
+    # The cubic stays below lowest + _OVERSHOOT (highest - lowest).
+    possible = (highest > lowest) & (lowest + _OVERSHOOT * (highest - lowest) > least)
+    defined = (planes[2] != 0) | (planes[3] != 0)
+    return planes, possible & defined & (planes[1][1:-1, 1:-1] < GAMMA_MAX)
+
+
+def _box(pick, padded, reach: int, h: int, w: int):
+    """The largest (or smallest) value within `reach` pixels, of an image padded by one pixel of its edge."""
+    out = jnp.pad(padded, reach - 1, mode="edge")
+    for axis, size in ((0, h), (1, w)):
+        width = 1
+        while width < 2 * reach + 1:  # windows of 1, 2, 4, ... pixels; the last two overlap
+            step = min(width, 2 * reach + 1 - width)
+            n = out.shape[axis] - step
+            out = pick(lax.slice_in_dim(out, 0, n, axis=axis), lax.slice_in_dim(out, step, step + n, axis=axis))
+            width += step
+        assert out.shape[axis] == size
+    return out
+
+
+@partial(jax.jit, static_argnames=("radius", "samples"))
+def _fit_listed(planes, listed, count, least, *, radius, samples) -> Profile:
+    """`_fit` at the listed pixels alone, in chunks that stay in the cache."""
+    height, _, theta_x, theta_y = planes
+    h, w = theta_x.shape
+    theta_x, theta_y = theta_x.ravel(), theta_y.ravel()
+
+    def chunk(k, out):
+        index = lax.dynamic_slice_in_dim(listed, k * _CHUNK, _CHUNK)
+        index = jnp.where(k * _CHUNK + lax.iota(jnp.int32, _CHUNK) < count, index, h * w)
+        inside = jnp.minimum(index, h * w - 1)
+        theta = theta_x[inside], theta_y[inside]
+        found = _fit(planes, inside // w, inside % w, *theta, least, radius=radius, samples=samples)
+        return tuple(o.at[index].set(f, mode="drop", unique_indices=False) for o, f in zip(out, found, strict=True))
+
+    empty = jnp.zeros(h * w, height.dtype)
+    out = lax.fori_loop(0, (count + _CHUNK - 1) // _CHUNK, chunk, (empty, empty, empty, jnp.zeros(h * w, bool)))
+    return Profile(*(o.reshape(h, w) for o in out))
+
+
+# ------------------------------------------------------------------------------------------- what is read
+
+
+def _planes(field):
+    """(height [H+2, W+2], singularity [H+2, W+2], theta_x [H, W], theta_y [H, W]), finite.
+
+    Where the field is fully singular (off the mask, on the far side of a depth step, beyond the border of the image) a
+    height means nothing, but a bilinear read next to it would mix it in: it is extrapolated from its regular
+    neighbours, linearly, so that no maximum comes from there.
+    """
+    finite = jnp.isfinite(field.height) & jnp.all(jnp.isfinite(field.direction), axis=-1)
+    most = 1e-3 * jnp.finfo(field.height.dtype).max
+    height = jnp.where(finite, jnp.clip(field.height, -most, most), 0)
+    theta = normalize(jnp.where(finite[..., None], field.direction, 0))
+    known = finite & ~jnp.isnan(field.singularity)
+    singular = jnp.where(known, jnp.clip(jnp.where(known, field.singularity, 0), 0, 1), 1)
+    height, singular = jnp.pad(height, 1), jnp.pad(singular, 1, constant_values=1)
+    regular = 1 - smoothstep(0.5, 1.0, singular)
+    height = regular * height + (1 - regular) * _extrapolated(height, regular)
+    return height, singular, theta[..., 0], theta[..., 1]
+
+
+def _extrapolated(height, regular):
+    """2 h(p + d) - h(p + 2d), averaged over those of eight directions d in which both are regular; else h(p + d)."""
+    h, w = height.shape
+    height, regular = jnp.pad(height, 2), jnp.pad(regular, 2)
+    totals = [jnp.zeros((h, w), height.dtype)] * 4
+    for dr, dc in ((r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)):
+        near, far = (np.s_[2 + k * dr : 2 + k * dr + h, 2 + k * dc : 2 + k * dc + w] for k in (1, 2))
+        one = regular[near]
+        both = one * regular[far]
+        values = (one, one * height[near], both, both * (2 * height[near] - height[far]))
+        totals = [total + value for total, value in zip(totals, values, strict=True)]
+    one, first, both, second = totals
+    first = jnp.where(one > 0, first / jnp.where(one > 0, one, 1), 0)
+    return jnp.where(both > 0, second / jnp.where(both > 0, both, 1), first)
+
+
+def _read(plane, row, col):
+    """Bilinear interpolation of a padded plane at positions counted in pixels of the image; clamped to the padding."""
+    h, w = plane.shape
+    r, c = jnp.clip(row + 1, 0, h - 1), jnp.clip(col + 1, 0, w - 1)
+    r0, c0 = jnp.minimum(jnp.floor(r), h - 2), jnp.minimum(jnp.floor(c), w - 2)
+    fr, fc = r - r0, c - c0
+    index = r0.astype(jnp.int32) * w + c0.astype(jnp.int32)
+    flat = plane.ravel()
+    a, b, d, e = (flat.at[index + step].get(mode="promise_in_bounds") for step in (0, 1, w, w + 1))
+    top, bottom = a + fc * (b - a), d + fc * (e - d)
+    return top + fr * (bottom - top)
+
+
+# ------------------------------------------------------------------------------------------- the profile
+
+
+def _barrier(gamma):
+    """What a sample adds to the accumulated singularity.
+
+    Sums of unit steps measure how thick a singularity is, and a diagonal line of single pixels is but 0.7 thick: as
+    printed it would let trajectories through. Strong singularities count up to three times, so that none does.
+    """
+    return jnp.minimum(gamma * (1 + 2 * smoothstep(0.1, 0.3, gamma)), 1)
+
+
+def _along(plane, row, col, theta_x, theta_y, t):
+    """Reads at x + t theta(x), [len(t), ...]; t: [S] or [S, ...], px."""
+    t = t.reshape(t.shape + (1,) * (row.ndim + 1 - t.ndim))
+    return _read(plane, row[None] - t * theta_y[None], col[None] + t * theta_x[None])
+
+
+def _reach(singular, row, col, theta_x, theta_y, radius: float):
+    """How far, in px, a neighbourhood extends on both sides before a singularity ends it (TH10 7.2.2).
+
+    A bilinear read sees a pixel from 1 px away, so it ends that much before the place where the sum reaches its limit.
+    """
+    steps = int(np.ceil(radius))
+    step = radius / steps
+    limit = GAMMA_MAX * (1 - 1e-3)
+    t = step * np.arange(-steps, steps + 1)
+    added = _barrier(_along(singular, row, col, theta_x, theta_y, jnp.asarray(t, row.dtype)))
+    start = added[steps]
+    reach = jnp.where(start < limit, radius, 0.0).astype(row.dtype)
+    for side in (1, -1):
+        total = start
+        for i in range(1, steps + 1):
+            before, total = total, total + added[steps + side * i]
+            crosses = (before < limit) & (total >= limit)
+            part = (limit - before) / jnp.where(crosses, total - before, 1)
+            reach = jnp.where(crosses, jnp.minimum(reach, (i - 1 + part) * step - 1), reach)
+    return reach
+
+
+def least_squares_matrix(samples: int) -> np.ndarray:
+    """[4, samples]: heights at t = -1 .. 1 to the cubic's coefficients a, b, c, d, of t^3, t^2, t, 1 (TH10 7.2.3)."""
+    t = np.linspace(-1, 1, samples)
+    return np.linalg.pinv(np.stack([t**3, t**2, t, np.ones_like(t)], axis=1))
+
+
+def _cubic(height, row, col, theta_x, theta_y, reach, samples: int):
+    """(a, b, c, d, size): the least-squares cubic of the heights, t = -1 .. 1 over ±reach, and the largest |height|.
+
+    Pairs of samples are added and subtracted first: b and d see the even part alone, a and c the odd one. Heights are
+    taken relative to the middle one, so that a small relief on a large height keeps its digits.
+    """
+    k = samples // 2
+    matrix = least_squares_matrix(samples)
+    share = jnp.asarray(np.arange(-k, k + 1) / k, reach.dtype).reshape(-1, *(1,) * reach.ndim)
+    heights = _along(height, row, col, theta_x, theta_y, share * reach[None])
+    middle, size = heights[k], jnp.max(jnp.abs(heights), axis=0)
+    a, b, c, d = (jnp.zeros_like(middle) for _ in range(4))
+    for i in range(1, k + 1):
+        ahead, behind = heights[k + i] - middle, heights[k - i] - middle
+        m = [float(v) for v in matrix[:, k + i]]
+        a, b = a + m[0] * (ahead - behind), b + m[1] * (ahead + behind)
+        c, d = c + m[2] * (ahead - behind), d + m[3] * (ahead + behind)
+    return a, b, c, d + middle, size
+
+
+def _fit(planes, row, col, theta_x, theta_y, least, *, radius: float, samples: int):
+    """(distance, height, curvature, valid) at integer pixels, as arrays of any shape."""
+    height, singular = planes[:2]
+    dtype = height.dtype
+    row, col = row.astype(dtype), col.astype(dtype)
+    defined = (theta_x != 0) | (theta_y != 0)
+    reach = _reach(singular, row, col, theta_x, theta_y, radius)
+    a, b, c, d, size = _cubic(height, row, col, theta_x, theta_y, reach, samples)
+
+    # In units of the largest coefficient nothing over- or underflows; the root does not depend on the unit.
+    unit = lax.stop_gradient(jnp.maximum(jnp.maximum(jnp.abs(a), jnp.abs(b)), jnp.abs(c)))
+    usable = defined & (reach >= LEAST_REACH * (1 - 1e-3)) & (unit > 32 * jnp.finfo(dtype).eps * size)
+    unit = jnp.where(usable, unit, 1)
+    a, b, c = (jnp.where(usable, v / unit, 0) for v in (a, b, c))
+
+    # p' = 3 a t^2 + 2 b t + c; of its two roots t_x = (-b - sqrt(D))/(3 a) = c/(-b + sqrt(D)) is the maximum, since
+    # there p'' = 6 a t + 2 b = -2 sqrt(D). The first form cancels for b < 0, the second for b > 0, where a = 0 means
+    # that there is no maximum.
+    discriminant = b * b - 3 * a * c
+    usable &= discriminant > 1e-6
+    root = jnp.sqrt(jnp.where(usable, discriminant, 1))
+    falling = b <= 0
+    above, below = jnp.where(falling, c, -b - root), jnp.where(falling, -b + root, 3 * a)
+    usable &= (jnp.abs(above) <= jnp.abs(below)) & (below != 0)  # |t_x| <= 1
+    usable &= root * unit > 32 * jnp.finfo(dtype).eps * size  # a maximum made of rounding alone
+    t = jnp.where(usable, above, 0) / jnp.where(usable, below, 1)
+    peak = ((a * t + b) * t + c) * t * unit + d
+    usable &= peak > least
+    span = jnp.where(usable, reach, 1)
+    return (
+        jnp.where(usable, t * span, 0),
+        jnp.where(usable, peak, 0),
+        jnp.where(usable, -2 * root * unit / (span * span), 0),
+        usable,
+    )
