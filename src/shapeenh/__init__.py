@@ -9,7 +9,9 @@ from shapeenh.buffers.points import gbuffer_from_points
 from shapeenh.buffers.sources import gbuffer_from_height, gbuffer_from_normals
 from shapeenh.buffers.textures import apply_texture, sample_texture
 from shapeenh.buffers.visibility import rasterize
+from shapeenh.descriptor.apparent import describe_apparent, describe_object
 from shapeenh.descriptor.display import curvature_colors
+from shapeenh.descriptor.relief import curvature_intensity, describe_relief
 from shapeenh.descriptor.view import (
     describe,
     gaussian_curvature,
@@ -29,6 +31,7 @@ from shapeenh.lines.fields import line_field, make_line_field
 from shapeenh.lines.profile import fit_profile
 from shapeenh.pipeline import enhance, render
 from shapeenh.scene.camera import frame_mesh, orthographic_camera, perspective_camera
+from shapeenh.scene.curvature import vertex_curvature
 from shapeenh.scene.environment import procedural_sky, procedural_studio, rotate_lights, sample_environment
 from shapeenh.scene.materials import named_material
 from shapeenh.scene.mesh import make_mesh, vertex_normals
@@ -70,8 +73,12 @@ __all__ = [
     "composite",
     "contrast",
     "curvature_colors",
+    "curvature_intensity",
     "decode_normals",
     "describe",
+    "describe_apparent",
+    "describe_object",
+    "describe_relief",
     "enhance",
     "estimate_normals",
     "estimate_radius",
@@ -112,6 +119,7 @@ __all__ = [
     "tone_map",
     "torus",
     "unwarp",
+    "vertex_curvature",
     "vertex_normals",
     "warp",
     "warp_jacobian",
