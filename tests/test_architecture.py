@@ -36,7 +36,7 @@ def imports_of(path: Path) -> set[tuple[str, ...]]:
 @pytest.mark.parametrize("path", FILES, ids=lambda p: "/".join(module_of(p)))
 def test_a_module_imports_only_what_its_layer_may(path):
     module, imports = module_of(path), imports_of(path)
-    if module[-1] in SEES_ALL and len(module) == 1:
+    if module[0] in SEES_ALL:
         return
     if module[0] in BASE:
         allowed = {("checks",), ("numerics",)} if module[0] == "checks" else set()
@@ -86,7 +86,7 @@ def test_only_solve_imports_jaxopt():
 def test_importing_the_package_neither_compiles_nor_configures():
     for path in FILES:
         module = module_of(path)
-        if module == ("cli",):
+        if module[0] == "cli":
             continue
         for node in ast.parse(path.read_text()).body:
             assert "config.update" not in ast.unparse(node) or isinstance(node, ast.FunctionDef), path

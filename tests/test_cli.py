@@ -76,6 +76,29 @@ def test_a_mesh_with_nan_goes_on_with_a_warning(tmp_path, capsys):
     assert capsys.readouterr().err.count("shapeenh: warning: ") == 1
 
 
+def test_height_fields_normal_maps_and_points_are_inputs_too(tmp_path):
+    y, x = np.mgrid[:36, :48]
+    height = np.float32(3 * np.sin(x / 5) * np.cos(y / 5))
+    height[:4, :4] = np.nan
+    se.save_image(tmp_path / "relief.tif", height)
+    normal = np.stack([-0.3 * np.cos(x / 5), 0 * x, np.ones(x.shape)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    se.save_image(tmp_path / "normals.png", np.uint16(np.round(65535 * (0.5 + 0.5 * normal))))
+    torus = se.torus(segments=16)
+    np.savetxt(tmp_path / "cloud.xyz", np.concatenate([torus.vertices, torus.normals], axis=1))
+    for name, kind, options in (
+        ("relief.tif", "height", ["--z-factor", "2"]),
+        ("normals.png", "normals", []),
+        ("cloud.xyz", "points", ["--size", "48x36", "--samples", "1"]),
+    ):
+        out = tmp_path / f"{kind}.png"
+        common = ["--as", kind, "-o", str(out), "--lights", "8", "--alpha", "300"]
+        assert main(["render", str(tmp_path / name), *common, *options]) == 0
+        image = se.load_image(out).astype(int)
+        assert image.shape == (36, 96, 3)
+        assert np.abs(image[:, :48] - image[:, 48:]).max() > 3
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -100,6 +123,11 @@ def test_a_mesh_with_nan_goes_on_with_a_warning(tmp_path, capsys):
         (["render", "-o", "OUT", "--material", "cheese"], "'cheese' is neither one of plaster"),
         (["render", "-o", "OUT", "--background", "#12"], "#RRGGBB"),
         (["render", "-o", "OUT", "--env", "MISSING.exr"], "MISSING.exr does not exist"),
+        (["render", "-o", "OUT", "--samples", "9"], "--samples is 9"),
+        (["render", "-o", "OUT", "--crease", "0"], "--crease is 0"),
+        (["render", "-o", "OUT", "--as", "height"], "needs an input file"),
+        (["render", "IMAGE.png", "-o", "OUT"], "accepted with --as height or --as normals"),
+        (["render", "IMAGE.png", "--as", "height", "--size", "9x9", "-o", "OUT"], "an image keeps its own size"),
         (["sculpt"], "invalid choice"),
     ],
 )

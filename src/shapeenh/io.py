@@ -17,6 +17,7 @@ from shapeenh.scene.mesh import check_faces, make_mesh
 from shapeenh.types import Mesh
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
+POINT_SUFFIXES = (".ply", ".xyz", ".txt", ".pts")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff")
 FAR_FROM_ORIGIN = 1e3  # centre distance over extent from which float32 loses visible detail: the mesh is then recentred
 
@@ -65,6 +66,72 @@ def load_mesh(path, *, crease_degrees: float | None = None) -> Mesh:
         if missing.any():
             normals = np.where(missing[:, None], _smooth_normals(vertices, faces, None)[2], normals)
     return make_mesh(vertices, faces, normals=normals, colors=colors, uv=uv)
+
+
+def load_points(path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Read a point cloud: PLY, or text (.xyz, .txt, .pts) with x y z or x y z nx ny nz in every line.
+
+    Points that are NaN or infinite are dropped, and a warning counts them; clouds far from the origin are recentred as
+    in `load_mesh`.
+
+    Returns: points [N, 3], normals [N, 3] or None, colours [N, 3] linear RGB or None.
+    Errors: FileNotFoundError; ValueError for another suffix, an unreadable file or no finite point.
+
+    >>> points, normals, colors = se.load_points("cloud.ply")
+    """
+    path = _existing(path)
+    suffix = path.suffix.lower()
+    if suffix not in POINT_SUFFIXES:
+        raise ValueError(f"{path} has the suffix {suffix!r}; accepted are point clouds {', '.join(POINT_SUFFIXES)}")
+    points, normals, colors = _read_ply_points(path) if suffix == ".ply" else _read_text_points(path)
+    good = np.isfinite(points).all(axis=1)
+    if not good.any():
+        raise ValueError(f"{path} holds no finite point; accepted is a cloud with at least one")
+    if not good.all():
+        warnings.warn(f"{path} holds {(~good).sum()} points that are NaN or infinite; they are dropped", stacklevel=2)
+    points, normals, colors = (None if a is None else a[good] for a in (points, normals, colors))
+    if normals is not None and not (np.linalg.norm(normals, axis=1) > 0).all():
+        normals = None  # incomplete normals are estimated anew
+    points = _recentred(path, points, np.arange(len(points)))
+    return tuple(None if a is None else np.asarray(a, np.float32) for a in (points, normals, colors))  # type: ignore
+
+
+def _read_ply_points(path: Path):
+    import trimesh
+
+    try:
+        cloud = trimesh.load(str(path), process=False)
+    except (MemoryError, KeyboardInterrupt):
+        raise
+    except BaseException as error:  # trimesh lets whatever its parsers meet through
+        raise ValueError(f"{path} cannot be read as a PLY point cloud: {_one_line(error)}") from None
+    if isinstance(cloud, trimesh.Scene):
+        cloud = next(iter(cloud.geometry.values()), None)
+    if cloud is None or len(getattr(cloud, "vertices", ())) == 0:
+        raise ValueError(f"{path} holds no points; accepted is a cloud with at least one")
+    points = np.asarray(cloud.vertices, np.float64)
+    rows = cloud.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    names = rows.dtype.names if getattr(rows, "dtype", None) is not None and rows.dtype.names else ()
+    normals = None
+    if {"nx", "ny", "nz"} <= set(names) and len(rows) == len(points):
+        normals = np.nan_to_num(np.stack([np.asarray(rows[n], np.float64).reshape(-1) for n in ("nx", "ny", "nz")], -1))
+    rgb = getattr(cloud, "colors", None)
+    colors = None if rgb is None or len(rgb) != len(points) else codecs.srgb_decode(np.asarray(rgb)[:, :3] / 255)
+    return points, normals, colors
+
+
+def _read_text_points(path: Path):
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            table = np.loadtxt(path, ndmin=2)
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be read as numbers: {_one_line(error)}") from None
+    if table.shape[0] == 0 or table.shape[1] not in (3, 6):
+        raise ValueError(
+            f"{path} holds {table.shape[0]} lines of {table.shape[1]} numbers; accepted are 3 or 6 in a line"
+        )
+    return table[:, :3], np.nan_to_num(table[:, 3:]) if table.shape[1] == 6 else None, None
 
 
 def _read_parts(path: Path) -> list[tuple]:
