@@ -5,6 +5,7 @@ from shapeenh.buffers.gbuffer import render_gbuffer
 from shapeenh.buffers.interpolate import barycentrics, interpolate
 from shapeenh.buffers.normal_map import apply_normal_map
 from shapeenh.buffers.normals import decode_normals
+from shapeenh.buffers.padding import pad_mesh
 from shapeenh.buffers.points import gbuffer_from_points
 from shapeenh.buffers.sources import gbuffer_from_height, gbuffer_from_normals
 from shapeenh.buffers.textures import apply_texture, sample_texture
@@ -100,6 +101,7 @@ __all__ = [
     "mean_curvature",
     "named_material",
     "orthographic_camera",
+    "pad_mesh",
     "perspective_camera",
     "plane",
     "principal_curvatures",

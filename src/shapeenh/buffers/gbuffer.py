@@ -65,17 +65,13 @@ def resolve_gbuffer(vertices, faces, tables, view, projection, triangle) -> GBuf
     """The jitted body of `render_gbuffer` behind the visibility, of checked arrays."""
     names = sorted(tables, key=("normal", "albedo", "uv").index)
     channels = {"depth": 1, "position": 3, **{name: tables[name].shape[1] for name in names}}
-    total = sum(channels.values())
     if faces.shape[0] == 0 or vertices.shape[0] == 0:
-        planes = [jnp.zeros(triangle.shape, vertices.dtype)] * total
+        made = [jnp.zeros((*triangle.shape, count), vertices.dtype) for count in channels.values()]
     else:
         m, _ = clip_matrix(view, projection)
-        planes = resolve(surface, vertices, [tables[name] for name in names], view, m, faces, triangle)
-    fields, at = {}, 0
-    for name, count in channels.items():
-        fields[name] = planes[0] if name == "depth" else jnp.stack(planes[at : at + count], -1)
-        at += count
-    return GBuffer(mask=triangle >= 0, **fields)
+        made = resolve(surface, vertices, [tables[name] for name in names], view, m, faces, triangle)
+    fields = dict(zip(channels, made, strict=True))
+    return GBuffer(mask=triangle >= 0, **{**fields, "depth": fields["depth"][..., 0]})
 
 
 def surface(view, b, blended, rows, inverse):
@@ -86,7 +82,7 @@ def surface(view, b, blended, rows, inverse):
     n = [sum(view[k, c] * normal[:, c] for c in range(3)) * side for k in range(3)]
     n = unit(n)
     n = unit([n[0], n[1], jnp.maximum(n[2], GRAZING)])
-    return [-z, x, y, z, *n, *(t[:, k] for t in others for k in range(t.shape[1]))]
+    return [[-z], [x, y, z], n, *([t[:, k] for k in range(t.shape[1])] for t in others)]
 
 
 def viewer_side(position, normal, inverse):

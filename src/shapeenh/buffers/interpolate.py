@@ -53,11 +53,11 @@ def check_seen(mesh, camera, visibility) -> None:
 
 
 def attributes(view, b, blended, rows, inverse):
-    return [blended[1][:, k] for k in range(blended[1].shape[1])]
+    return [[blended[1][:, k] for k in range(blended[1].shape[1])]]
 
 
 def corner_weights(view, b, blended, rows, inverse):
-    return list(b)
+    return [list(b)]
 
 
 @jax.jit
@@ -74,4 +74,4 @@ def resolved(finish, channels, vertices, tables, view, projection, faces, triang
     if faces.shape[0] == 0 or vertices.shape[0] == 0 or channels == 0:
         return jnp.zeros((*triangle.shape, channels), vertices.dtype)
     m, _ = clip_matrix(view, projection)
-    return jnp.stack(resolve(finish, vertices, list(tables), view, m, faces, triangle), -1)
+    return resolve(finish, vertices, list(tables), view, m, faces, triangle)[0]

@@ -113,26 +113,41 @@ def forward(finish, position, tables, view, m, faces, ids):
     shapes = jax.eval_shape(
         values, view, [lane] * 3, [jax.ShapeDtypeStruct((1, 3, k, LANES), dtype) for _, k in packed], lane
     )
-    # run-time zeros, one each: equal constants would be one broadcast and a copy per plane
-    planes = [
-        jnp.broadcast_to(jnp.where(flat[0] < -2 - k, dtype.type(1), dtype.type(0)), (size,)) for k in range(len(shapes))
-    ]
+    counts = [len(field) for field in shapes]
+    # run-time zeros, one each: equal constants would be one broadcast and a copy per field
+    zeros = [jnp.where(flat[0] < -2 - k, dtype.type(1), dtype.type(0)) for k in range(len(counts))]
+    fields = [jnp.broadcast_to(zero, (size * count,)) for zero, count in zip(zeros, counts, strict=True)]
 
     def step(state):
-        i, planes = state
+        i, fields = state
         start = run_start(lax.dynamic_slice(runs, (i * group,), (group,)), size)
         covered, _, rows = corners(always, packed, flat_faces, flat, start)
         ax, ay = stored(always, lambda m, start, x: relative(m, start, x, height, width), m, start, rows[0])
-        b, _, inverse, _ = stored(always, barycentrics, ax, ay)
+
+        def weights(ax, ay):
+            b, _, inverse, _ = barycentrics(ax, ay)
+            return jnp.stack([*b, inverse], 1)  # one kernel: a list of results would be computed once for each
+
+        packed_b = stored(always, weights, ax, ay)
+        b, inverse = [packed_b[:, k] for k in range(3)], packed_b[:, 3]
 
         def last(view, b, rows, inverse, covered):
-            return [jnp.where(covered, t, 0) for t in values(view, b, rows, inverse)]
+            return [[jnp.where(covered, t, 0) for t in field] for field in values(view, b, rows, inverse)]
 
         new = stored(always, last, view, b, rows, inverse, covered)
-        return i + 1, [write_runs(t, start, u) for t, u in zip(planes, new, strict=True)]
+        # channel-last, as it will stay: interleaving whole images later would cost more than computing them
+        new = stored(always, lambda new: [interleave(field) for field in new], new)
+        writes = zip(fields, new, counts, strict=True)
+        return i + 1, [write_runs(t, start * count, u) for t, u, count in writes]
 
-    planes = lax.while_loop(lambda state: state[0] * group < total, step, (jnp.int32(0), planes))[1]
-    return [t[: height * width].reshape(height, width) for t in planes]
+    fields = lax.while_loop(lambda state: state[0] * group < total, step, (jnp.int32(0), fields))[1]
+    used = height * width
+    return [t[: used * n].reshape((height, width, n)) for t, n in zip(fields, counts, strict=True)]
+
+
+def interleave(planes):
+    """[runs, LANES * planes] of planes [runs, LANES]."""
+    return jnp.stack(planes, -1).reshape(planes[0].shape[0], -1)
 
 
 # ------------------------------------------------------------------------------------------- reverse
@@ -154,7 +169,8 @@ def backward(finish, position, tables, view, m, faces, ids, cotangents):
     always = faces[0, 0] >= np.iinfo(np.int32).min
     flat, group, runs, total, packed, flat_faces = prepare(position, tables, faces, ids)
     size = flat.size
-    flat_ct = [jnp.pad(t.reshape(-1), (0, size - t.size)) for t in cotangents]
+    counts = [t.shape[-1] for t in cotangents]
+    flat_ct = [jnp.pad(t.reshape(-1), (0, size * n - t.size)) for t, n in zip(cotangents, counts, strict=True)]
     columns = [k for _, k in packed]
     used = sum(columns)
     row_size = -(-used // 8) * 8
@@ -172,7 +188,10 @@ def backward(finish, position, tables, view, m, faces, ids, cotangents):
         b, raw, inverse, held = stored(always, barycentrics, ax, ay)
 
         def finished(view, b, rows, inverse, covered, ct, start):
-            g = [jnp.where(covered, read_runs(t, start), 0) for t in ct]
+            g = []
+            for t, n in zip(ct, counts, strict=True):
+                new = read_runs(t, start * n, LANES * n).reshape(group, LANES, n)
+                g.append([jnp.where(covered, new[..., k], 0) for k in range(n)])
             blended = [blend(b, t) for t in rows]
             _, pull = jax.vjp(lambda view, b, blended: finish(view, b, blended, rows, inverse), view, b, blended)
             g_view, g_b, g_blended = pull(g)
@@ -233,9 +252,9 @@ def backward(finish, position, tables, view, m, faces, ids, cotangents):
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def resolve(finish: Callable, position, tables, view, m, faces, ids):
-    """Planes [H, W] that `finish` makes of interpolated positions and tables; 0 off the mask.
+    """Fields [H, W, C] that `finish` makes of interpolated positions and tables; 0 off the mask.
 
-    finish(view, b, blended, rows, inverse) -> list of planes [runs, LANES]: b the three weights, blended
+    finish(view, b, blended, rows, inverse) -> per field a list of C planes [runs, LANES]: b the three weights, blended
     [runs, columns, LANES] of the position and each table, rows [runs, 3, columns, LANES] their corners (constants of
     the derivative), inverse 1/s, whose sign is positive for a front face.
     """

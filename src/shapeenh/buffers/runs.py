@@ -46,15 +46,15 @@ def run_start(run, size):
     return jnp.minimum(run * LANES, size - LANES)
 
 
-def read_runs(flat, start):
-    """[runs, LANES] windows of flat [n]."""
+def read_runs(flat, start, width=LANES):
+    """[runs, width] windows of flat [n]."""
     numbers = lax.GatherDimensionNumbers(offset_dims=(1,), collapsed_slice_dims=(), start_index_map=(0,))
     mode = lax.GatherScatterMode.PROMISE_IN_BOUNDS
-    return lax.gather(flat, start[:, None], numbers, (LANES,), mode=mode)
+    return lax.gather(flat, start[:, None], numbers, (width,), mode=mode)
 
 
 def write_runs(flat, start, new):
-    """flat [n] with the windows `new` [runs, LANES] written at `start`."""
+    """flat [n] with the windows `new` [runs, width] written at `start`."""
     numbers = lax.ScatterDimensionNumbers(
         update_window_dims=(1,), inserted_window_dims=(), scatter_dims_to_operand_dims=(0,)
     )
