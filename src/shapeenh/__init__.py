@@ -28,8 +28,11 @@ from shapeenh.io import load_environment, load_image, load_mesh, save_image
 from shapeenh.light.brdf import ashikhmin_shirley
 from shapeenh.light.radiance import shade, shade_warped
 from shapeenh.light.warp import unwarp, warp, warp_jacobian, warp_tensor
+from shapeenh.lines.brush import Brush, composite_lines, draw_lines
 from shapeenh.lines.fields import line_field, make_line_field
+from shapeenh.lines.noise import surface_noise
 from shapeenh.lines.profile import fit_profile
+from shapeenh.lines.styles import style_brush, style_footprint
 from shapeenh.pipeline import enhance, render
 from shapeenh.scene.camera import frame_mesh, orthographic_camera, perspective_camera
 from shapeenh.scene.curvature import vertex_curvature
@@ -53,6 +56,7 @@ from shapeenh.types import (
 )
 
 __all__ = [
+    "Brush",
     "Camera",
     "Descriptor",
     "FitResult",
@@ -72,6 +76,7 @@ __all__ = [
     "barycentrics",
     "carved_knot",
     "composite",
+    "composite_lines",
     "contrast",
     "curvature_colors",
     "curvature_intensity",
@@ -80,6 +85,7 @@ __all__ = [
     "describe_apparent",
     "describe_object",
     "describe_relief",
+    "draw_lines",
     "enhance",
     "estimate_normals",
     "estimate_radius",
@@ -118,6 +124,9 @@ __all__ = [
     "shade",
     "shade_warped",
     "sphere",
+    "style_brush",
+    "style_footprint",
+    "surface_noise",
     "tone_map",
     "torus",
     "unwarp",

@@ -52,7 +52,7 @@ class Brush:
     flow: jax.Array | float = 3.0
     radius: jax.Array | float = 1.5
     aspect: jax.Array | float = 1.0
-    width: jax.Array | float = 0.5
+    width: jax.Array | float = 0.8
     spread: jax.Array | float = 0.0
     low: jax.Array | float = 0.0
     high: jax.Array | float = 1e-6

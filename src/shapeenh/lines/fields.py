@@ -21,6 +21,7 @@ from shapeenh.types import Descriptor, GBuffer, LineField
 KINDS = ("occlusion", "surface", "luminance", "ridge", "valley", "inflection")
 LEAST_HEIGHT = 1e-5  # slopes and curvatures per px below this are rounding, not shape: no direction there
 GREATEST_SIGMA = 20.0
+_STEP_SIGMA = 1.5  # px
 _STEP = 0.2  # of an explicit diffusion step (SPEC 3.5)
 
 # ------------------------------------------------------------------------------------------- public
@@ -46,7 +47,8 @@ def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=1.0) -> 
         descriptor: Descriptor of the same image; None for luminance without geometry.
         luminance: [H, W], for kind "luminance" and no other.
         sigma: [], px, in [0, 20]: heights and directions are diffused this far, insulated by silhouettes. (Occlusion
-            lines live *on* the silhouettes: they are diffused freely, background included.)
+            lines live *on* the silhouettes: they are diffused freely, background included, and by 1.5 px more, since a
+            step is thinner than any profile.)
 
     Static: kind.
     Returns: LineField [H, W]; 0 off the mask with singularity 1 there, except occlusion lines, which straddle the
@@ -119,6 +121,7 @@ def _line_field(gbuffer, descriptor, luminance, sigma, *, kind) -> LineField:
     if kind == "occlusion":
         height, double = _occlusion(gbuffer, silhouette)
         good, silhouette = jnp.ones_like(good), jnp.zeros_like(silhouette)
+        sigma = jnp.sqrt(sigma * sigma + _STEP_SIGMA**2)
     elif kind in ("ridge", "valley"):
         height, double = _curvature(jnp.where(good[..., None], descriptor.hessian, 0), kind)
     else:
