@@ -28,6 +28,10 @@ LIMIT = 1 << 30  # within a tile |a dx + b dy| is less: an edge function further
 F64, I64, I32, F32 = jnp.float64, jnp.int64, jnp.int32, jnp.float32
 
 
+def tile_count(height, width):
+    return -(-height // TILE) * -(-width // TILE)
+
+
 def cast(value, dtype):
     return lax.convert_element_type(value, dtype)
 
@@ -139,7 +143,11 @@ def draw_tiles(keys, vertices, face, index, xyr, even, valid, m, near, shift, *,
     point = stored(always, points, index, xyr, m, wide_near, wide_shift)
     abc = stored(always, lines, point[3:6])
     edges = stored(always, integer_edges, abc, point[3:6], xyr)
-    box = stored(always, lambda *t: tile_box(*t, height, width, cull), point, abc, xyr, even, valid)
+
+    def boxes(point, abc, xyr, even, valid):
+        return tile_box(point, abc, xyr, even, valid, height, width, cull)
+
+    box = stored(always, boxes, point, abc, xyr, even, valid)
     plane = stored(always, nearness_lines, point, abc)
     limits = stored(always, nearness_range, xyr, near, shift)
     ends = jnp.cumsum(box[3], dtype=jnp.int32)

@@ -18,7 +18,7 @@ from shapeenh import checks
 from shapeenh.buffers.bins import WINDOWS, ascending, bin_faces, corner_indices, select
 from shapeenh.buffers.inputs import check_camera, check_mesh
 from shapeenh.buffers.project import SUB, clip_matrix, nearness, nearness_shift, project
-from shapeenh.buffers.tiles import FACES, TILE, draw_tiles
+from shapeenh.buffers.tiles import FACES, TILE, draw_tiles, tile_count
 from shapeenh.buffers.windows import (
     edge_functions,
     merge,
@@ -33,6 +33,7 @@ from shapeenh.types import Camera, Mesh, Visibility
 
 CHUNK = 4096  # faces per step
 SLOTS = 65536  # candidate pixels per step
+BORDER = max(TILE, *(k for window in WINDOWS for k in window))  # windows may hang over the right and lower edge
 CULL = {False: "none", None: "none", "none": "none", True: "back", "back": "back", "front": "front"}
 
 
@@ -51,7 +52,8 @@ def rasterize(mesh: Mesh, camera: Camera, *, height: int, width: int, cull: bool
     *Gradient*: none; `interpolate` has the gradients of what is seen.
     *Errors*: ValueError for NaN or infinite vertices (how many), a face index out of range, a wrong shape or option.
     Under jit, where values cannot be looked at, faces with such vertices are not drawn. Recompiles for a new V, F,
-    height, width or cull only. `vmap` is correct and takes one view after the other.
+    height, width or cull only; `pad_mesh` keeps V and F on a ladder. `vmap` is correct and takes one view after the
+    other.
     """
     checks.check_type("mesh", mesh, Mesh)
     checks.check_type("camera", camera, Camera)
@@ -83,82 +85,88 @@ def visible_triangles(vertices, faces, view, projection, *, height, width, cull)
 
 
 def draw(vertices, faces, m, near, height, width, cull):
+    """triangle [height, width]: the whole rasteriser, for at least one face."""
     count = faces.shape[0]
     always = faces[0, 0] >= np.iinfo(np.int32).min
-    flat_faces = faces.reshape(-1)
     with jax.enable_x64(True):  # 64-bit keys, whatever the caller's precision
         corners = stored(always, lambda v, m, near: project(v, m, near, height, width), vertices, m, near)
         shift = nearness_shift(corners)
         words, ends = bin_faces(always, faces, corners, height, width, cull)
         totals = ends[:, -1]
-        flat_words, flat_ends, flat_corners = words.reshape(-1), ends.reshape(-1), corners.reshape(-1)
+        flat_words, flat_ends, flat_corners, flat_faces = (t.reshape(-1) for t in (words, ends, corners, faces))
 
-        border = max([TILE] + [k for window in WINDOWS for k in window])  # windows may hang over the lower right edge
-        stride = width + border
+        stride = width + BORDER
         chunk = min(CHUNK, -(-count // 256) * 256)
-        steps = jnp.cumsum((totals + (chunk - 1)) // chunk, dtype=jnp.int32)
-
-        faces_at_once = max(1, min(FACES, (2**31 - 1) // (-(-height // TILE) * -(-width // TILE))))  # counts fit int32
+        steps = jnp.cumsum((totals + (chunk - 1)) // chunk, dtype=jnp.int32)  # of all classes up to this one
 
         def step(state):
+            """The next chunk of faces of one class: found, fetched, drawn."""
             i, keys = state
             row = jnp.sum(i >= steps, dtype=jnp.int32)
+            first_rank = (i - jnp.where(row > 0, steps[row - 1], 0)) * chunk
+            rank = first_rank + lax.iota(jnp.int32, chunk)
             total = totals[row]
-            rank = (i - jnp.where(row > 0, steps[row - 1], 0)) * chunk + lax.iota(jnp.int32, chunk)
 
             def find(rank):
                 return select(flat_words, flat_ends, row, jnp.minimum(rank, total - 1), count)
 
-            face = stored(always, find, rank)
-
             def fetch(face):
                 index, even = ascending(corner_indices(flat_faces, face))
-                part = np.arange(3, dtype=np.int32)[:, None, None] * vertices.shape[0]
-                return take(flat_corners, index[None] + part), index, even
+                plane = np.arange(3, dtype=np.int32)[:, None, None] * vertices.shape[0]
+                return take(flat_corners, index[None] + plane), index, even
 
+            face = stored(always, find, rank)
             xyr, index, even = stored(always, fetch, face)
-            valid = rank < total
-
-            def setup(xyr, valid):
-                origin = jnp.stack(window_origin(xyr[0], xyr[1], height, width))
-                x, y = xyr[0] - (origin[0] << SUB)[None], xyr[1] - (origin[1] << SUB)[None]
-                edges = edge_functions(x, y, valid).reshape(9, -1).astype(jnp.float32)
-                plane = nearness_plane(x, y, nearness(xyr[2]) - shift)
-                return jnp.concatenate([edges, plane]), origin[1] * stride + origin[0]
-
-            planes, first = stored(always, setup, xyr, valid)
+            there = jnp.minimum(total - first_rank, chunk)
             # one loop per class, of which all but one take no step: unlike a conditional, a loop updates in place
-            for k, (rows, columns) in enumerate(WINDOWS):
-                part = min(chunk // 2, SLOTS // (rows * columns))
+            sizes = [jnp.where(row == k, there, 0) for k in range(len(WINDOWS) + 1)]
+            keys = draw_windows(always, keys, face, xyr, rank < total, shift, sizes[:-1], height, width)
 
-                def draw_part(j, keys, rows=rows, columns=columns, part=part):
-                    def cut(*tables):
-                        return [lax.dynamic_slice_in_dim(t, j * part, part, -1) for t in tables]
-
-                    both, low, start = stored(always, cut, planes, ~face.astype(jnp.uint32), first)
-                    edges, plane = both[:9].reshape(3, 3, -1), both[9:]
-                    if rows * columns <= 4:
-                        new = stored(always, lambda *t: pixel_keys(*t, rows, columns), edges, plane, low)
-                        return merge_pixels(keys, new, start, stride, columns)
-                    return merge(keys, window_keys(edges, plane, low, rows, columns), start, stride)
-
-                parts = jnp.where(row == k, (jnp.minimum(total - rank[0], chunk) + (part - 1)) // part, 0)
-                keys = lax.fori_loop(jnp.int32(0), parts, draw_part, keys)
-
-            part = min(chunk // 2, faces_at_once)
+            part = max(1, min(chunk // 2, FACES, (2**31 - 1) // tile_count(height, width)))  # so that counts fit int32
 
             def draw_large(j, keys):
-                cut = [lax.dynamic_slice_in_dim(t, j * part, part, -1) for t in (face, index, xyr, even, valid)]
+                f, i, c, e, v = cut(j * part, part, face, index, xyr, even, rank < total)
                 return draw_tiles(
-                    keys, vertices, *cut, m, near, shift, height=height, width=width, cull=cull, stride=stride
+                    keys, vertices, f, i, c, e, v, m, near, shift, height=height, width=width, cull=cull, stride=stride
                 )
 
-            parts = jnp.where(row == len(WINDOWS), (jnp.minimum(total - rank[0], chunk) + (part - 1)) // part, 0)
-            keys = lax.fori_loop(jnp.int32(0), parts, draw_large, keys)
+            keys = lax.fori_loop(jnp.int32(0), (sizes[-1] + (part - 1)) // part, draw_large, keys)
             return i + 1, keys
 
-        keys = jnp.zeros(((height + border) * stride,), jnp.uint64)
+        keys = jnp.zeros(((height + BORDER) * stride,), jnp.uint64)
         keys = lax.while_loop(lambda state: state[0] < steps[-1], step, (jnp.int32(0), keys))[1]
-        keys = keys.reshape(height + border, stride)[:height, :width]
+        keys = keys.reshape(height + BORDER, stride)[:height, :width]
         face = lax.bitcast_convert_type(~lax.convert_element_type(keys, jnp.uint32), jnp.int32)
         return jnp.where(keys == 0, jnp.int32(-1), face)
+
+
+def cut(start, size, *tables):
+    return [lax.dynamic_slice_in_dim(t, start, size, -1) for t in tables]
+
+
+def draw_windows(always, keys, face, xyr, valid, shift, sizes, height, width):
+    """The first `sizes[k]` of the faces [n], as faces of class k + 1, into the keys."""
+    stride = width + BORDER
+
+    def setup(xyr, valid):
+        origin = jnp.stack(window_origin(xyr[0], xyr[1], height, width))
+        x, y = xyr[0] - (origin[0] << SUB)[None], xyr[1] - (origin[1] << SUB)[None]
+        edges = edge_functions(x, y, valid).reshape(9, -1).astype(jnp.float32)
+        return jnp.concatenate([edges, nearness_plane(x, y, nearness(xyr[2]) - shift)]), origin[1] * stride + origin[0]
+
+    planes, first = stored(always, setup, xyr, valid)
+    for (rows, columns), size in zip(WINDOWS, sizes, strict=True):
+        part = min(face.shape[0] // 2, SLOTS // (rows * columns))
+
+        def draw_part(j, keys, rows=rows, columns=columns, part=part):
+            both, low, start = stored(
+                always, lambda *t: cut(j * part, part, *t), planes, ~face.astype(jnp.uint32), first
+            )
+            edges, plane = both[:9].reshape(3, 3, -1), both[9:]
+            if rows * columns > 4:
+                return merge(keys, window_keys(edges, plane, low, rows, columns), start, stride)
+            new = stored(always, lambda e, p, low: pixel_keys(e, p, low, rows, columns), edges, plane, low)
+            return merge_pixels(keys, new, start, stride, columns)
+
+        keys = lax.fori_loop(jnp.int32(0), (size + (part - 1)) // part, draw_part, keys)
+    return keys
