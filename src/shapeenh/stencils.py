@@ -31,11 +31,9 @@ def stored(always, function, *args):
 
 def unknown_truth(*arrays):
     """True, but only at run time can that be seen: the `always` of `stored`, unless all arrays are constants."""
-    total = 0.0
-    for array in arrays:
-        corner = lax.stop_gradient(jnp.ravel(array)[0])
-        total = total + jnp.where(jnp.abs(corner) < 1, corner, 0)
-    return total < len(arrays)  # a sum of squares is known not to be negative, and would be folded
+    corners = [lax.stop_gradient(jnp.ravel(array)[0]) for array in arrays]
+    total = sum(jnp.where(jnp.abs(corner) < 1, corner, 0) for corner in corners)
+    return total < len(arrays)  # not a sum of squares >= 0, which would be folded
 
 
 # ------------------------------------------------------------------------------------------- neighbours

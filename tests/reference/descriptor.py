@@ -28,7 +28,7 @@ def from_height(x, y, z, gx, gy, mask=None):
     }
 
 
-# ------------------------------------------------------------------------------------------- surfaces: (fields, Hessian)
+# ------------------------------------------------------------------------------------------- (fields, Hessian)
 
 
 def waves(height, width, wavelength=64.0, amplitude=5.0, mask=None):
@@ -85,7 +85,7 @@ def torus(height, width, ring, tube):
 
 
 def traced_spheres(height, width, spheres, fov_degrees=40.0):
-    """Spheres (centre [3] in camera space, radius) seen in perspective; nearest wins. Also returns the index seen, -1 for none."""
+    """Spheres (centre [3] in camera space, radius) in perspective; also returns the index seen, -1 for none."""
     size = 2 * np.tan(np.deg2rad(fov_degrees) / 2) / height
     x, y = pixel_grid(height, width, size)
     ray = np.stack([x, y, -np.ones_like(x)], -1)

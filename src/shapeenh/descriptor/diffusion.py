@@ -50,7 +50,7 @@ def _count(budget, step):
     return jnp.ceil(jnp.max(budget) / step - 1e-6).astype(jnp.int32)
 
 
-def _forward(start, stop, planes, link_x, link_y, budget, weight, step):
+def _forward(start, stop, planes, link_x, link_y, budget, weight, *, step):
     def one(k, g):
         return g + (_share(budget, k, step) * weight)[None] * divergence(g, link_x, link_y)
 
@@ -68,12 +68,12 @@ def explicit(planes, link_x, link_y, budget, weight, step=STEP, slots=(8, 8, 8, 
     The number of steps is read at run time, so nothing recompiles when the budget changes; the last step is as
     short as it has to be, so the result is continuous in the budget.
     """
-    return _forward(0, _count(budget, step), planes, link_x, link_y, budget, weight, step)
+    return _forward(0, _count(budget, step), planes, link_x, link_y, budget, weight, step=step)
 
 
 def _explicit_fwd(planes, link_x, link_y, budget, weight, step, slots):
     fixed = (link_x, link_y, budget, weight)
-    return _forward(0, _count(budget, step), planes, *fixed, step), (planes, fixed)
+    return _forward(0, _count(budget, step), planes, *fixed, step=step), (planes, fixed)
 
 
 def _explicit_bwd(step, slots, saved, cotangent):
@@ -119,7 +119,7 @@ def _reverse(start, count, g, carry, fixed, step, slots):
         states, g = kept
         states = lax.dynamic_update_index_in_dim(states, g, i, 0)
         first = start + i * span
-        return states, _forward(first, first + jnp.where(i + 1 < pieces, span, 0), g, *fixed, step)
+        return states, _forward(first, first + jnp.where(i + 1 < pieces, span, 0), g, *fixed, step=step)
 
     def back(j, carry):
         i = pieces - 1 - j
@@ -182,7 +182,7 @@ def _even(array, size):
     )
 
 
-def _roles(volume, border_x, border_y, spacing):
+def _roles(volume, border_x, border_y, *, spacing):
     """The role of every pixel, int8; 0 for none. All sizes even."""
     strong_x, strong_y = border_x >= _STRONG * spacing, border_y >= _STRONG * spacing
     v = _quarters(volume)
@@ -251,8 +251,9 @@ def _conduct(border, volume, axis: int, spacing, step):
     return link[:, :-1] if axis == -1 else link[:-1]
 
 
-def _descend(stacks, level: int, time, volume, border_x, border_y, always, levels: int, sure: bool):
+def _descend(stacks, level: int, time, cells, always, levels: int, sure: bool):
     """Diffuse a tuple of plane stacks on the cells of one level for `time`."""
+    volume, border_x, border_y = cells
     spacing = 2.0**level
     step = STEP * spacing**2
     smoothing = step * _SMOOTHING[min(level, 1)]
@@ -276,8 +277,8 @@ def _descend(stacks, level: int, time, volume, border_x, border_y, always, level
     def coarse(stacks):
         size = h, w = volume.shape
         v, bx, by = _even(volume, size), _even(border_x, size), _even(border_y, size)
-        role = stored(always, lambda *a: _roles(*a, spacing), v, bx, by)
-        cells = stored(always, _merge, v, bx, by, role)
+        role = stored(always, lambda *a: _roles(*a, spacing=spacing), v, bx, by)
+        below = stored(always, _merge, v, bx, by, role)
 
         def down(planes, role, v, volume):
             return _gather(_even(planes, size) * v[None], role) / jnp.where(volume > 0, volume, 1)[None]
@@ -287,8 +288,8 @@ def _descend(stacks, level: int, time, volume, border_x, border_y, always, level
 
         aside = jnp.full((1, 1), smoothing, volume.dtype)
         stacks = smooth(stacks, aside, _SMOOTHING[min(level, 1)])
-        lower = tuple(stored(always, down, planes, role, v, cells[0]) for planes in stacks)
-        lower = _descend(lower, level + 1, rest, *cells, always, levels, sure)
+        lower = tuple(stored(always, down, planes, role, v, below[0]) for planes in stacks)
+        lower = _descend(lower, level + 1, rest, below, always, levels, sure)
         stacks = tuple(stored(always, up, c, planes, role) for c, planes in zip(lower, stacks, strict=True))
         return smooth(stacks, aside, _SMOOTHING[min(level, 1)])
 
@@ -309,7 +310,7 @@ def diffuse_stacks(stacks, link_x, link_y, budget, alive, always, *, levels: int
         one = jnp.ones((1, 1), link_x.dtype)
         return tuple(explicit(planes, link_x, link_y, budget, one, STEP, (8,) * -levels) for planes in stacks)
     border_x, border_y = jnp.pad(link_x, ((0, 0), (0, 1))), jnp.pad(link_y, ((0, 1), (0, 0)))
-    return _descend(stacks, 0, budget, alive.astype(link_x.dtype), border_x, border_y, always, levels, sure)
+    return _descend(stacks, 0, budget, (alive.astype(link_x.dtype), border_x, border_y), always, levels, sure)
 
 
 def levels_for(sigma: float) -> int:

@@ -47,31 +47,31 @@ def depth_gradient(normal, foreshortening):
 # b in [0, 1] says how much of it: after diffusion the fold is gone, and b = 0 is the identity.
 
 
-def _stretch(g, foreshortening):
-    """(q = |g|^2, s); below |g| = 1e-6, where s is as good as 0 but not smooth, both are held."""
+def _stretch(g, foreshortening, bend):
+    """(q = |g|^2, s, b, b f / 2); below |g| = 1e-6, where s is as good as 0 but not smooth, q is held.
+
+    At f = 0 nothing folds, and s would be a step at |g| = 1: b goes to 0 as f does.
+    """
     q = jnp.maximum(g[0] * g[0] + g[1] * g[1], 1e-12)
     if foreshortening is None:
-        return q, q
-    return q, jnp.exp(jnp.log(q) / jnp.maximum(foreshortening, 0.02))
+        b = 1.0 if bend is None else bend
+        return q, q, b, 0.5 * b
+    b = jnp.clip(2 * foreshortening - 0.1, 0, 1) * (1.0 if bend is None else bend)
+    f = jnp.maximum(foreshortening, 0.05)
+    return q, jnp.exp(jnp.log(q) / f), b, 0.5 * b * f
 
 
-def _power(s, foreshortening, bend):
-    """(1 + s)^(b f / 2); `bend` None = 1."""
-    if foreshortening is None and bend is None:
-        return jnp.sqrt(1 + s)
-    return jnp.exp(
-        0.5 * (1 if bend is None else bend) * (1 if foreshortening is None else foreshortening) * jnp.log1p(s)
-    )
+def _power(s, exponent):
+    return jnp.sqrt(1 + s) if isinstance(exponent, float) else jnp.exp(exponent * jnp.log1p(s))
 
 
 def to_chart(g, foreshortening, bend):
-    """phi(g), `[2, H, W]`."""
-    _, s = _stretch(g, foreshortening)
-    return g / _power(s, foreshortening, bend)[None]
+    """phi(g), `[2, H, W]`; `bend` None = 1."""
+    _, s, _, exponent = _stretch(g, foreshortening, bend)
+    return g / _power(s, exponent)[None]
 
 
 def from_chart(g, foreshortening, bend):
     """(scale, along), [H, W]: a small change dphi of phi(g) belongs to the change scale (I + along g g^T) dphi of g."""
-    q, s = _stretch(g, foreshortening)
-    along = s / q if bend is None else bend * s / ((1 + (1 - bend) * s) * q)
-    return _power(s, foreshortening, bend), along
+    q, s, b, exponent = _stretch(g, foreshortening, bend)
+    return _power(s, exponent), b * s / ((1 + (1 - b) * s) * q)

@@ -15,8 +15,9 @@ def vertex_curvature(mesh) -> jax.Array:
 
     mesh: Mesh, its normals unit.
     Returns [V, 6], (xx, xy, xz, yy, yz, zz) of a symmetric 3x3 tensor in world space, 1/world unit, that maps the
-    normal to 0: its other eigenvalues are the principal curvatures, negative on convexities, its eigenvectors their directions.
-    It needs no tangent frame, so it can be interpolated. Degenerate faces count for nothing; 0 at vertices without faces.
+    normal to 0: its other eigenvalues are the principal curvatures, negative on convexities, its eigenvectors their
+    directions. It needs no tangent frame, so it can be interpolated. Degenerate faces count for nothing; 0 at vertices
+    without faces.
     Gradient: with respect to vertices and normals.
     Errors: ValueError for what is not a Mesh.
 
@@ -35,7 +36,7 @@ def _vertex_curvature(vertices, normals, faces):
     cross = jnp.cross(edge[:, 0], edge[:, 1])
     area = 0.5 * norm(cross)
 
-    # the tensor (a, b, c) of each face, in a frame of its plane: [p q 0; 0 p q] (a, b, c) = (dn.u, dn.v) for three edges
+    # the tensor (a, b, c) of each face in a frame of its plane: [p q 0; 0 p q] (a, b, c) = (dn.u, dn.v) for three edges
     size = jnp.max(norm(edge), axis=1)
     flat = normalize(cross)
     u = normalize(edge[:, 0])
