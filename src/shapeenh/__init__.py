@@ -26,7 +26,8 @@ from shapeenh.fit.to_contrast import fit_contrast
 from shapeenh.fit.to_image import fit_image
 from shapeenh.io import load_environment, load_image, load_mesh, save_image
 from shapeenh.light.brdf import ashikhmin_shirley
-from shapeenh.light.radiance import shade, shade_warped
+from shapeenh.light.radiance import shade, shade_scaled, shade_warped
+from shapeenh.light.scaling import curvature_mapping, radiance_scale
 from shapeenh.light.warp import unwarp, warp, warp_jacobian, warp_tensor
 from shapeenh.lines.brush import Brush, composite_lines, draw_lines
 from shapeenh.lines.fields import line_field, make_line_field
@@ -80,6 +81,7 @@ __all__ = [
     "contrast",
     "curvature_colors",
     "curvature_intensity",
+    "curvature_mapping",
     "decode_normals",
     "describe",
     "describe_apparent",
@@ -114,6 +116,7 @@ __all__ = [
     "principal_directions",
     "procedural_sky",
     "procedural_studio",
+    "radiance_scale",
     "rasterize",
     "render",
     "render_gbuffer",
@@ -122,6 +125,7 @@ __all__ = [
     "sample_texture",
     "save_image",
     "shade",
+    "shade_scaled",
     "shade_warped",
     "sphere",
     "style_brush",

@@ -1,4 +1,4 @@
-"""Reflected radiance: the sums over lights, plain and warped (SPEC 5 and 7; LW09 eq. 2 and 3)."""
+"""Reflected radiance: the sums over lights, plain, warped and scaled (SPEC 5, 6, 7; LW09 eq. 2 and 3; TH10 5.3)."""
 
 from __future__ import annotations
 
@@ -7,68 +7,176 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
-from shapeenh import checks, numerics
-from shapeenh.light import brdf, warp
+from shapeenh import checks
+from shapeenh.light import brdf, sums, warp
+from shapeenh.light.weights import Model, gain
 from shapeenh.types import Descriptor, GBuffer, Lights, Material
 
-
-def shading_normal(normal):
-    """The normal that is shaded: as given where it faces the viewer, mirrored in the image plane where it does not.
-
-    A visible surface faces the viewer, but interpolated normals overshoot at the limb. There every BRDF is 0 and a
-    black rim would result; with |n_z| the limb continues the shading of the pixels before it.
-    """
-    return jnp.concatenate([normal[..., :2], jnp.abs(normal[..., 2:])], axis=-1)
+# ------------------------------------------------------------------------------------------- what a pixel brings
+# A prologue turns inputs, planes (block, channel, 64) by name, into the planes of the weights and the factors that stay
+# outside the sum; an epilogue applies the factors. Both are differentiated by JAX.
 
 
-@functools.partial(jax.jit, static_argnames=("warped",))
-def _shade(mask, normal, albedo, hessian, lights, material, alpha, gamma, *, warped):
-    n = jnp.where(mask[..., None], shading_normal(normal), jnp.asarray([0.0, 0.0, 1.0], normal.dtype)[None, None])
-    view = jnp.asarray([0.0, 0.0, 1.0], normal.dtype)
-    tensor = warp.warp_tensor(jnp.where(mask[..., None], hessian, 0), alpha) if warped else None
-    diffuse = jnp.broadcast_to(material.diffuse, normal.shape) * (1 if albedo is None else albedo)
-    material = Material(diffuse, jnp.broadcast_to(material.specular, normal.shape), material.shininess)
+def _prologue(model: Model, inputs):
+    normal = inputs["normal"]
+    # A visible surface faces the viewer, but interpolated normals overshoot at the limb. There every reflectance is 0,
+    # and a black rim would result; with |n_z| the limb continues the shading of the pixels before it.
+    nx, ny, nz = normal[:, 0], normal[:, 1], jnp.abs(normal[:, 2])
+    planes = {"nx": nx, "ny": ny, "nz": nz, "shininess": inputs["shininess"][:, 0]}
 
-    @jax.checkpoint
-    def add(total, light):
-        direction, radiance = light
-        cos_warped = jnp.sum(n * direction[None, None], axis=-1)
-        if warped:
-            l, weight = warp.unwarp(direction, tensor), warp.warp_jacobian(direction, tensor)
+    factor = jnp.ones_like(nz)
+    if model.warped or model.scaled:
+        hessian = inputs["hessian"]
+        xx, xy, yy = hessian[:, 0], hessian[:, 1], hessian[:, 2]
+        concave = inputs["concave"][:, 0]
+    if model.warped:
+        alpha = inputs["alpha"][:, 0]
+        tensor = warp.spectral(jnp.stack([xx, xy, yy], axis=-1), -alpha, -alpha * concave)  # L^-1
+        a, b, c = tensor[..., 0], tensor[..., 1], tensor[..., 2]
+        planes |= {"ux": a * nx + b * ny, "uy": b * nx + c * ny}
+        planes |= {"qxx": a * a + b * b, "qxy": b * (a + c), "qyy": b * b + c * c}
+        det = a * c - b * b
+        factor = det * jnp.exp(-inputs["contrast"][:, 0] * jnp.log(det))  # J's factor, and eq. 3
+    if model.scaled:
+        strengths = {name: inputs[name][:, 0] for name in ("gamma_diffuse", "gamma_specular")}
+        mean, half = 0.5 * xx + 0.5 * yy, 0.5 * xx - 0.5 * yy
+        # Off the mask inputs are 0, and sigma would be 0/0 there.
+        planes["invariant"] = jnp.where(inputs["invariant"][:, 0] > 0, inputs["invariant"][:, 0], 0.5)
+        if model.anisotropic:
+            anisotropy = inputs["anisotropy"][:, 0]
+            rxx, rxy, ryy = half, xy, -half
+            if model.warped:  # l_xy = sqrt(j) T p', so T goes around the deviator of the Hessian
+                rxx, rxy, ryy = (
+                    a * (a * half + b * xy) + b * (a * xy - b * half),
+                    b * (a * half + b * xy) + c * (a * xy - b * half),
+                    b * (b * half + c * xy) + c * (b * xy - c * half),
+                )
+            planes |= {"mean": mean, "concave": concave} | strengths
+            planes |= {"rxx": anisotropy * rxx, "rxy": anisotropy * rxy, "ryy": anisotropy * ryy}
         else:
-            l, weight = jnp.broadcast_to(direction, n.shape), 1.0
-        cos = jnp.sum(n * l, axis=-1)
-        weight = jnp.where((cos > 0) & (cos_warped > 0), cos * weight, 0)
-        rho = brdf.ashikhmin_shirley(n, l, view, material)
-        return total + rho * weight[..., None] * radiance[None, None], None
+            kappa = jnp.tanh(mean)
+            kappa = jnp.where(kappa > 0, concave * kappa, kappa)
+            planes |= {f"gain_{name[6:]}": gain(strength * kappa) for name, strength in strengths.items()}
 
-    total, _ = lax.scan(add, jnp.zeros_like(normal), (lights.direction, lights.radiance))
-    if warped:
-        total = total * jnp.exp(gamma * jnp.log(numerics.determinant(tensor)))[..., None]
-    return jnp.where(mask[..., None], total, 0)
+    specular = inputs["specular"]
+    diffuse = inputs["diffuse"] * (1 - specular)
+    if "albedo" in inputs:
+        diffuse = diffuse * inputs["albedo"]
+    facing = brdf.DIFFUSE * (1 - (1 - 0.5 * nz) ** 5) * factor
+    peak = (inputs["shininess"] + 1) / (8 * np.pi) * factor[:, None]
+    return planes, (diffuse * facing[:, None], specular * peak, (1 - specular) * peak)
 
 
-def _check(gbuffer, lights, material):
+def _epilogue(totals, factors):
+    return sum(total * factor for total, factor in zip(totals, factors, strict=True))
+
+
+def _reach(model: Model) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    """Which planes of the weights each input of the prologue moves."""
+    tensor = ("ux", "uy", "qxx", "qxy", "qyy") if model.warped else ()
+    bend = ("rxx", "rxy", "ryy") if model.anisotropic else ()
+    table = {"normal": ("nx", "ny", "nz", *tensor[:2]), "shininess": ("shininess",)}
+    if model.warped:
+        table |= {"alpha": (*tensor, *bend)}
+    if model.scaled and model.anisotropic:
+        table |= {"anisotropy": bend, "concave": (*tensor, *bend, "concave"), "hessian": (*tensor, *bend, "mean")}
+        table |= {name: (name,) for name in ("gamma_diffuse", "gamma_specular")}
+    elif model.scaled:
+        gains = ("gain_diffuse", "gain_specular")
+        table |= {"concave": (*tensor, *gains), "hessian": (*tensor, *gains)}
+        table |= {f"gamma_{name[5:]}": (name,) for name in gains}
+    else:
+        table |= {"concave": tensor, "hessian": tensor}
+    if model.scaled:
+        table["invariant"] = ("invariant",)
+    return tuple(table.items())
+
+
+# ------------------------------------------------------------------------------------------- the Python layer
+
+
+@functools.partial(jax.jit, static_argnames=("plan",))
+def _shade_image(plan, mask, inputs, direction, radiance, count):
+    return sums.shade_image(plan, mask, inputs, direction, radiance, count)
+
+
+def _shade(model: Model, gbuffer, lights, material, options: dict):
+    """Common to all: checks, skips what the scene does not need, and calls the compiled sum."""
     checks.check_type("gbuffer", gbuffer, GBuffer)
     checks.check_type("lights", lights, Lights)
     checks.check_type("material", material, Material)
     checks.check_shape("gbuffer.normal", gbuffer.normal, (None, None, 3))
-    checks.check_shape("gbuffer.mask", gbuffer.mask, np.shape(gbuffer.normal)[:2])
+    size = np.shape(gbuffer.normal)[:2]
+    checks.check_shape("gbuffer.mask", gbuffer.mask, size)
+    brdf.check_material(material)
+
+    dtype = checks.float_dtype(gbuffer.normal)
+    inputs = {"normal": jnp.asarray(gbuffer.normal, dtype)}
     if gbuffer.albedo is not None:
-        checks.check_shape("gbuffer.albedo", gbuffer.albedo, np.shape(gbuffer.normal))
+        checks.check_shape("gbuffer.albedo", gbuffer.albedo, (*size, 3))
+        inputs["albedo"] = jnp.asarray(gbuffer.albedo, dtype)
+    for name, value, channels in (
+        ("diffuse", material.diffuse, 3),
+        ("specular", material.specular, 3),
+        ("shininess", material.shininess, 1),
+    ):
+        inputs[name] = _input(f"material.{name}", value, size, channels, dtype)
+    for name, value in options.items():
+        inputs[name] = jnp.asarray(value, dtype) if name == "hessian" else _input(name, value, size, 1, dtype)
+
+    direction, radiance, count = _prepared_lights(lights, dtype)
+    plan = sums.Plan(model, _prologue, _epilogue, _reach(model), *_steps())
+    return _shade_image(plan, jnp.asarray(gbuffer.mask, bool), inputs, direction, radiance, count)
+
+
+def _input(name, value, size, channels, dtype):
+    """A number or [channels] as a constant [channels]; a map [H, W] or [H, W, channels] as an image."""
+    shape = np.shape(value)
+    if shape in ((), (channels,)):
+        return jnp.broadcast_to(jnp.asarray(value, dtype), (channels,))
+    if shape in (size, (*size, channels)):
+        return jnp.broadcast_to(jnp.asarray(value, dtype).reshape(*size, -1), (*size, channels))
+    text = "[]" if channels == 1 else f"[], [{channels}]"
+    raise ValueError(f"{name} has shape {shape}; accepted is {text} or a map of {size[0]} x {size[1]} pixels")
+
+
+def _steps() -> tuple[int, int]:
+    """Blocks and lights per step: what stays in a CPU's cache, or what fills an accelerator."""
+    return (128, 8) if jax.default_backend() == "cpu" else (4096, 16)
+
+
+def _prepared_lights(lights, dtype):
+    """Directions and colours, padded to one of few sizes, and how many shine: other numbers compile nothing."""
     checks.check_shape("lights.direction", lights.direction, (None, 3))
     checks.check_shape("lights.radiance", lights.radiance, np.shape(lights.direction))
     checks.check_finite("lights.direction", lights.direction)
     checks.check_finite("lights.radiance", lights.radiance)
-    brdf.check_material(material)
+    direction, radiance = lights.direction, lights.radiance
+    if checks.is_concrete(lights):
+        direction, radiance = np.asarray(direction), np.asarray(radiance)
+        shining = np.any(radiance != 0, axis=-1)
+        direction, radiance = direction[shining], radiance[shining]
+    count = direction.shape[0]
+    extra = sums.ladder(count, 8) - count
+    pad = jnp if not checks.is_concrete(lights) else np
+    direction = pad.concatenate([direction, pad.broadcast_to(pad.asarray([0.0, 0.0, 1.0]), (extra, 3))])
+    radiance = pad.concatenate([radiance, pad.zeros((extra, 3))])
+    return jnp.asarray(direction, dtype), jnp.asarray(radiance, dtype), jnp.asarray(count, jnp.int32)
 
 
-def _call(gbuffer, hessian, lights, material, alpha, gamma, warped):
-    dtype = checks.float_dtype(gbuffer.normal)
-    lights, material = jax.tree.map(lambda a: jnp.asarray(a, dtype), (lights, material))
-    return _shade(gbuffer.mask, gbuffer.normal, gbuffer.albedo, hessian, lights, material, alpha, gamma, warped=warped)
+def _is_zero(*values) -> bool:
+    """Known to be zero: concrete, and nothing but zeros."""
+    return all(checks.is_concrete(v) and not np.any(np.asarray(v)) for v in values)
+
+
+def _check_descriptor(descriptor, gbuffer):
+    checks.check_type("gbuffer", gbuffer, GBuffer)
+    checks.check_type("descriptor", descriptor, Descriptor)
+    checks.check_shape("descriptor.hessian", descriptor.hessian, np.shape(gbuffer.normal))
+
+
+# ------------------------------------------------------------------------------------------- the public functions
 
 
 def shade(gbuffer, lights, material):
@@ -76,30 +184,80 @@ def shade(gbuffer, lights, material):
 
     Source: SPEC 7; `sum over i of rho(z, l_i) <n.l_i> L_i`.
     gbuffer: `GBuffer`; `albedo`, where there is one, multiplies the diffuse reflectance. lights: `Lights` in the frame
-    of the normals (camera space). material: `Material`.
-    Returns [H, W, 3], linear radiance, >= 0; 0 off the mask. At the limb, where interpolated normals turn away from the
-    viewer, |n_z| is used (`shading_normal`).
-    Gradient: exact in normals, albedo, lights and material. Errors: ValueError for wrong records, shapes, values.
+    of the normals (camera space). material: `Material`; each field may also be a map [H, W] or [H, W, 3].
+    Returns [H, W, 3], linear radiance, >= 0; 0 off the mask and where an input is not finite. At the limb, where
+    interpolated normals turn away from the viewer, |n_z| is used.
+    Gradient: exact in normals, albedo, lights (directions: along the sphere) and material; memory does not grow with
+    the number of lights. Errors: ValueError for wrong records, shapes, values.
     """
-    _check(gbuffer, lights, material)
-    return _call(gbuffer, None, lights, material, 0.0, 0.0, False)
+    return _shade(Model(), gbuffer, lights, material, {})
 
 
-def shade_warped(gbuffer, descriptor, lights, material, *, alpha, gamma=0.0):
+def shade_warped(gbuffer, descriptor, lights, material, *, alpha, gamma=0.0, concave=1.0):
     """Radiance reflected towards the viewer with the light bent by the surface's curvature.
 
     Source: LW09 eq. 2 and 3; SPEC 5, inverse form: `det(L)^gamma sum rho(z, l_i) <n.l_i> L_i J`, l_i = W^-1(l'_i).
     gbuffer, lights, material: as in `shade`. descriptor: `Descriptor`; its `hessian` is used.
-    alpha: [], px, any finite value: strength; 0 = no warp. gamma: [], in [-1, 1]: contrast; 0 = none.
-    Returns [H, W, 3], linear radiance, >= 0; 0 off the mask. `alpha = gamma = 0` gives `shade` up to rounding.
-    Gradient: exact in alpha, gamma, hessian, normals, albedo, lights and material.
+    alpha: [] or a map [H, W], px, any finite value: strength; 0 = no warp. gamma: [] or [H, W], in [-1, 1]: contrast;
+    0 = none. concave: [] or [H, W]: the strength of concavities (positive curvatures) relative to convexities.
+    Returns [H, W, 3], linear radiance, >= 0; 0 off the mask. `alpha = 0` gives `shade` up to rounding, and is as fast.
+    Gradient: exact in alpha, gamma, concave, hessian, normals, albedo, lights and material.
     Errors: ValueError for wrong records, shapes, values.
     """
-    _check(gbuffer, lights, material)
-    checks.check_type("descriptor", descriptor, Descriptor)
-    checks.check_shape("descriptor.hessian", descriptor.hessian, np.shape(gbuffer.normal))
+    _check_descriptor(descriptor, gbuffer)
     checks.check_finite("alpha", alpha)
     checks.check_range("gamma", gamma, -1, 1)
-    dtype = checks.float_dtype(gbuffer.normal)
-    alpha, gamma = jnp.asarray(alpha, dtype), jnp.asarray(gamma, dtype)
-    return _call(gbuffer, jnp.asarray(descriptor.hessian, dtype), lights, material, alpha, gamma, True)
+    checks.check_finite("concave", concave)
+    if _is_zero(alpha):
+        return shade(gbuffer, lights, material)
+    options = {"hessian": descriptor.hessian, "alpha": alpha, "contrast": gamma, "concave": concave}
+    return _shade(Model(warped=True), gbuffer, lights, material, options)
+
+
+def shade_scaled(
+    gbuffer,
+    descriptor,
+    lights,
+    material,
+    *,
+    invariant,
+    gamma_diffuse,
+    gamma_specular,
+    anisotropy=0.0,
+    concave=1.0,
+    alpha=0.0,
+    contrast=0.0,
+):
+    """Radiance reflected towards the viewer, each light's share made brighter or darker by the surface's curvature.
+
+    Source: TH10 5.3; SPEC 6: `sum rho <n.l_i> sigma(kappa(p, l_i), delta) L_i`, delta = n.l for the diffuse, n.h for
+    the specular component. With `alpha` both ways at once (TH10 fig. 5.26): the lights are warped, kappa and delta
+    taken at the unwarped directions.
+    gbuffer, lights, material, descriptor: as in `shade_warped`.
+    invariant: [] or [H, W], in ]0, 1[: the level that is left alone. gamma_diffuse, gamma_specular: [] or [H, W], >= 0:
+    strengths; 0 = none. anisotropy: [] or [H, W], in [-1, 1]. concave: [] or [H, W]: strength of concavities relative
+    to convexities. alpha, contrast: the warp's strength, px, and its exponent in [-1, 1].
+    Returns [H, W, 3], linear radiance, >= 0; 0 off the mask. Strengths of 0 give `shade` up to rounding, and are as
+    fast.
+    Gradient: exact in all strengths, hessian, normals, albedo, lights and material.
+    Errors: ValueError for wrong records, shapes, values.
+    """
+    _check_descriptor(descriptor, gbuffer)
+    checks.check_range("invariant", invariant, 0, 1, open_ends=True)
+    checks.check_range("gamma_diffuse", gamma_diffuse, 0, np.inf)
+    checks.check_range("gamma_specular", gamma_specular, 0, np.inf)
+    checks.check_range("anisotropy", anisotropy, -1, 1)
+    checks.check_finite("concave", concave)
+    checks.check_finite("alpha", alpha)
+    checks.check_range("contrast", contrast, -1, 1)
+    warped = not _is_zero(alpha)
+    if _is_zero(gamma_diffuse, gamma_specular):
+        return shade_warped(gbuffer, descriptor, lights, material, alpha=alpha, gamma=contrast, concave=concave)
+    model = Model(warped=warped, scaled=True, anisotropic=not _is_zero(anisotropy))
+    options = {"hessian": descriptor.hessian, "concave": concave, "invariant": invariant}
+    options |= {"gamma_diffuse": gamma_diffuse, "gamma_specular": gamma_specular}
+    if model.anisotropic:
+        options["anisotropy"] = anisotropy
+    if warped:
+        options |= {"alpha": alpha, "contrast": contrast}
+    return _shade(model, gbuffer, lights, material, options)

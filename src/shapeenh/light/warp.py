@@ -95,23 +95,33 @@ def _factor_difference(x1, x2, dx):
     return 2 * sixth * (1 + t1 * t2) / ((1 - t1) * (1 - t2))
 
 
-def _divided_difference(k1, k2, alpha):
+def _strength(k, convex, concave):
+    """The strength that a principal curvature is bent with: convexities are negative."""
+    return jnp.where(k < 0, convex, concave)
+
+
+def _divided_difference(k1, k2, convex, concave):
     """(lam(k1) - lam(k2)) / (k1 - k2), and lam'(k1) where both are equal."""
+    alpha1, alpha2 = _strength(k1, convex, concave), _strength(k2, convex, concave)
+    x1, x2 = _scaled_curvature(k1, alpha1), _scaled_curvature(k2, alpha2)
     gap = k1 - k2
-    x1, x2, dx = (_scaled_curvature(k, alpha) for k in (k1, k2, gap))
+    dx = jnp.where(alpha1 == alpha2, _scaled_curvature(gap, alpha1), x1 - x2)
     difference = _factor_difference(x1, x2, dx)
-    return jnp.where(gap == 0, alpha * _factor_slope(x1), difference / jnp.where(gap == 0, 1, gap))
+    return jnp.where(gap == 0, alpha1 * _factor_slope(x1), difference / jnp.where(gap == 0, 1, gap))
 
 
 @jax.custom_jvp
-def _tensor(hessian, alpha):
+def spectral(hessian, convex, concave):
+    """lam(H) of `[..., 3]` with strengths [...] of negative and of positive curvatures; see `warp_tensor`."""
     return numerics.matrix_function(
-        hessian, lambda k: _factor(_scaled_curvature(k, alpha)), lambda k1, k2: _divided_difference(k1, k2, alpha)
+        hessian,
+        lambda k: _factor(_scaled_curvature(k, _strength(k, convex, concave))),
+        lambda k1, k2: _divided_difference(k1, k2, convex, concave),
     )
 
 
-@_tensor.defjvp
-def _tensor_jvp(primals, tangents):
+@spectral.defjvp
+def _spectral_jvp(primals, tangents):
     """Daleckii-Krein without eigenvectors: with D the deviator of H, r its length and c = D/r (0 at umbilics),
 
         d mean     = (f1' (dHm + dr) + f2' (dHm - dr)) / 2 + d alpha (g1 + g2) / 2,      dr = c . dD
@@ -119,39 +129,46 @@ def _tensor_jvp(primals, tangents):
 
     f' = alpha h(alpha k), g = k h(alpha k). Every factor is bounded; autodiff of the value would divide by r^2.
     """
-    (hessian, alpha), (dh, da) = primals, tangents
+    hessian, convex, concave = primals
+    dh, d_convex, d_concave = tangents
     k1, k2 = numerics.eigenvalues(hessian)
     d, xy = 0.5 * hessian[..., 0] - 0.5 * hessian[..., 2], hessian[..., 1]
     r = numerics.safe_hypot(d, xy)
     cd, cx = numerics.safe_divide(d, r), numerics.safe_divide(xy, r)
-    h1, h2 = (_factor_slope(_scaled_curvature(k, alpha)) for k in (k1, k2))
     dd, dx, mean = 0.5 * dh[..., 0] - 0.5 * dh[..., 2], dh[..., 1], 0.5 * dh[..., 0] + 0.5 * dh[..., 2]
     dr = cd * dd + cx * dx
-    f1 = h1 * (alpha * (mean + dr) + k1 * da)
-    f2 = h2 * (alpha * (mean - dr) + k2 * da)
-    slope = _divided_difference(k1, k2, alpha)
-    along, mean = 0.5 * f1 - 0.5 * f2, 0.5 * f1 + 0.5 * f2
-    dd = along * cd + slope * (dd - cd * dr)
-    dx = along * cx + slope * (dx - cx * dr)
-    return _tensor(hessian, alpha), jnp.stack([mean + dd, dx, mean - dd], axis=-1)
+
+    def along(k, dk):
+        alpha, d_alpha = _strength(k, convex, concave), _strength(k, d_convex, d_concave)
+        return _factor_slope(_scaled_curvature(k, alpha)) * (alpha * dk + k * d_alpha)
+
+    f1, f2 = along(k1, mean + dr), along(k2, mean - dr)
+    slope = _divided_difference(k1, k2, convex, concave)
+    change, mean = 0.5 * f1 - 0.5 * f2, 0.5 * f1 + 0.5 * f2
+    dd = change * cd + slope * (dd - cd * dr)
+    dx = change * cx + slope * (dx - cx * dr)
+    return spectral(hessian, convex, concave), jnp.stack([mean + dd, dx, mean - dd], axis=-1)
 
 
-def warp_tensor(hessian, alpha):
+def warp_tensor(hessian, alpha, *, concave=1.0):
     """The warp tensor `lam(H)`, lam(k) = tan(atan(alpha k)/6 + pi/4), as a matrix function of the Hessian.
 
     Source: LW09 5.1; SPEC 5 and 3 (spectral functions without eigenvectors).
     hessian: [..., 3] (xx, xy, yy), 1/px; any finite value. alpha: [] or [...], px, any finite value; `-alpha` gives the
-    inverse tensor.
+    inverse tensor. concave: [] or [...]: the strength of positive (concave) curvatures relative to alpha.
     Returns [..., 3], positive definite, eigenvalues in [tan(pi/6), tan(pi/3)]; the identity, exactly, where alpha = 0
     or the Hessian is 0 (as off the mask).
-    Gradient: exact in hessian and alpha, umbilics included; finite everywhere.
-    Errors: ValueError for a last axis other than 3, or a concrete alpha that is not finite.
+    Gradient: exact in hessian and alpha, umbilics included; finite everywhere. With concave != 1 it has a kink where a
+    curvature is 0.
+    Errors: ValueError for a last axis other than 3, or a concrete alpha or concave that is not finite.
     """
     checks.check_shape("hessian", hessian, (..., 3))
     checks.check_finite("alpha", alpha)
+    checks.check_finite("concave", concave)
     dtype = checks.float_dtype(hessian)
     hessian = jnp.asarray(hessian, dtype)
-    return _tensor(hessian, jnp.broadcast_to(jnp.asarray(alpha, dtype), hessian.shape[:-1]))
+    alpha, concave = (jnp.broadcast_to(jnp.asarray(a, dtype), hessian.shape[:-1]) for a in (alpha, concave))
+    return spectral(hessian, alpha, alpha * concave)
 
 
 # ------------------------------------------------------------------------------------------- warped directions

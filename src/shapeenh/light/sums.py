@@ -1,0 +1,380 @@
+"""The sum over lights of every covered pixel, and its adjoint (SPEC 5 and 6: the reflection integrals, sampled).
+
+`shade_image` walks the covered blocks in groups. Per group a *prologue* turns the pixels' inputs into the planes that
+the weights need, the light loop adds up weight times colour, and an *epilogue* makes radiance of the sums. Per block
+only
+the lights that its normals can see are visited: those for which the largest n.l over the box of its normals is
+positive.
+
+The adjoint is a second walk: prologue and epilogue are differentiated by JAX, the light loop by hand: a pixel's
+cotangent is known once its sum is, so one more visit of its lights gives everything, and memory does not depend on
+their number.
+
+Measured on CPU: three sums kept apart take a tenth of the time of one stacked array, because XLA computes a fused
+producer again for every output; `stored` keeps the weights from being fused into the sums for the same reason.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from shapeenh.light import blocks
+from shapeenh.light import weights as kernel
+from shapeenh.stencils import stored
+
+SPAN = 128  # lights whose visibility is decided at a time
+
+
+class Plan(NamedTuple):
+    """What is summed; static. Inputs are dicts of planes, (block, channel, 64), by name.
+
+    prologue: model, inputs -> (planes of `kernel.planes_of(model)`, each (block, 64), rest), rest any pytree of arrays.
+    epilogue: (sums, rest) -> (block, 3, 64); sums are the three components' (block, 3, 64); linear in them.
+    reach: which planes each input moves, so that derivatives nobody asks for are not computed.
+    group, chunk: blocks per step and lights per step.
+    """
+
+    model: kernel.Model
+    prologue: Callable
+    epilogue: Callable
+    reach: tuple[tuple[str, tuple[str, ...]], ...]
+    group: int = 128
+    chunk: int = 8
+
+
+# ------------------------------------------------------------------------------------------- lights
+
+
+def ladder(count: int, chunk: int) -> int:
+    """Rows to which a table of lights is padded: few sizes, so that few shapes are compiled."""
+    size = chunk
+    while size < count:
+        size *= 2
+    return size
+
+
+def _light_table(direction, radiance, rows: int):
+    """[rows + 1, 8 + 3] coefficients and colours; what lies beyond the given lights is dark."""
+    table = jnp.concatenate([kernel.coefficients(direction), radiance], axis=-1)
+    dark = jnp.asarray([[1, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0]], table.dtype)
+    return jnp.concatenate([table, jnp.broadcast_to(dark, (rows + 1 - table.shape[0], dark.shape[1]))])
+
+
+def _seen(low, high, table):
+    """[lights, boxes]: which lights can light some normal of the boxes low..high [3, boxes]."""
+    most = sum(
+        jnp.maximum(table[:, 1 + k, None] * low[None, k], table[:, 1 + k, None] * high[None, k]) for k in range(3)
+    )
+    return most > 0
+
+
+def _compact(active, first, dark):
+    """Numbers of the active lights of each block, [blocks, lights], first ones first, then `dark`; and how many."""
+    lights, count = active.shape
+    # A triangular product counts faster than a cumulative sum.
+    until = jnp.dot(
+        np.tril(np.ones((lights, lights), np.float32)), active.astype(jnp.float32), precision=lax.Precision.HIGHEST
+    ).astype(jnp.int32)
+    number, block = (lax.broadcasted_iota(jnp.int32, active.shape, axis) for axis in (0, 1))
+    lists = jnp.full((count, lights + 1), dark, jnp.int32)
+    lists = lists.at[block, jnp.where(active, until - 1, lights)].set(first + number, mode="promise_in_bounds")
+    return lists[:, :lights], until[-1]
+
+
+def _light_loop(plan: Plan, box, table, count, body, carry):
+    """`body(carry, numbers, rows)` over chunks of lights that the blocks see: (block, chunk), (block, chunk, 11)."""
+    rows = table.shape[0] - 1
+    span = min(rows, SPAN)
+    low, high = box
+
+    def over_span(i, carry):
+        part = lax.dynamic_slice_in_dim(table, i * span, span)
+        number = i * span + lax.iota(jnp.int32, span)
+        active = _seen(low, high, part) & (number < count)[:, None]
+        lists, lengths = _compact(active, i * span, rows)
+
+        def over_chunk(j, carry):
+            numbers = lax.dynamic_slice_in_dim(lists, j * plan.chunk, plan.chunk, axis=1)
+            return body(carry, numbers, table.at[numbers].get(mode="promise_in_bounds"))
+
+        return lax.fori_loop(0, -(-jnp.max(lengths) // plan.chunk), over_chunk, carry)
+
+    return lax.fori_loop(0, -(-count // span), over_span, carry)
+
+
+def _unpack(rows):
+    """Coefficients by name, (block, light, 1), and colours (block, light, 3)."""
+    light = {name: rows[:, :, i, None] for i, name in enumerate(kernel.COEFFICIENTS)}
+    return light, rows[:, :, len(kernel.COEFFICIENTS) :]
+
+
+def _forms(model: kernel.Model, planes, light):
+    """The forms, and whether the (warped) light itself is in front of the surface; planes (block, plane, 64)."""
+    plane = {name: planes[:, None, i] for i, name in enumerate(kernel.planes_of(model))}
+    form = kernel.forms(model, plane, light)
+    if model.warped:
+        form["facing"] = plane["nx"] * light["x"] + plane["ny"] * light["y"] + plane["nz"] * light["z"]
+    return form
+
+
+def _add_weighted(total, weight, colour):
+    """total (block, channel, 64) + sum over lights of weight (block, light, 64) colour (block, light, channel)."""
+    return total + sum(weight[:, b, None, :] * colour[:, b, :, None] for b in range(weight.shape[1]))
+
+
+# ------------------------------------------------------------------------------------------- the walk
+
+
+class _Walk(NamedTuple):
+    """The covered blocks in the order of their work, padded by repeating the last, and the boxes of their normals."""
+
+    ids: jax.Array
+    total: jax.Array
+    low: jax.Array
+    high: jax.Array
+    group: int
+
+
+def _plan_walk(plan: Plan, mask, normal, table, count) -> _Walk:
+    covered = jnp.any(blocks.tiled(mask), axis=(1, 3)).reshape(-1)
+    group = min(plan.group, covered.shape[0])
+    ids, total = blocks.listed(jnp.zeros(covered.shape, jnp.int32), covered, group)
+
+    def box(i, found):
+        part = lax.dynamic_slice_in_dim(ids, i * group, group)
+        n, valid = blocks.read(normal, part), blocks.read(mask, part)
+        n = jnp.concatenate([n[:, :2], jnp.abs(n[:, 2:])], axis=1)  # as the prologue shades it
+        valid = valid & (jnp.abs(n) <= 2)
+        ends = blocks.least(jnp.where(valid, n, 2)), -blocks.least(jnp.where(valid, -n, 2))
+        return tuple(
+            lax.dynamic_update_slice_in_dim(a, new.T, i * group, axis=1) for a, new in zip(found, ends, strict=True)
+        )
+
+    empty = jnp.zeros((3, ids.shape[0]), normal.dtype)
+    low, high = lax.fori_loop(0, -(-total // group), box, (empty, empty))
+
+    def count_light(i, seen):
+        return seen + (_seen(low, high, lax.dynamic_slice_in_dim(table, i, 1))[0]).astype(jnp.int32)
+
+    work = lax.fori_loop(0, count, count_light, jnp.zeros(ids.shape, jnp.int32))
+    order, _ = blocks.listed(work, lax.iota(jnp.int32, ids.shape[0]) < total, group)
+    return _Walk(ids[order], total, low[:, order], high[:, order], group)
+
+
+def _read_inputs(inputs, mask, ids):
+    """Planes of every input at the pixels of some blocks, and where they are valid; elsewhere 0, and n = z."""
+    found = {
+        name: blocks.read(value, ids)
+        if value.ndim >= 2
+        else jnp.broadcast_to(value[None, :, None], (len(ids), len(value), blocks.PIXELS))
+        for name, value in inputs.items()
+    }
+    valid = blocks.read(mask, ids)
+    for value in found.values():
+        valid = valid & jnp.all(jnp.isfinite(value), axis=1, keepdims=True)
+    found = {name: jnp.where(valid, value, 0) for name, value in found.items()}
+    z = jnp.where(valid, found["normal"][:, 2:], 1)
+    found["normal"] = jnp.concatenate([found["normal"][:, :2], z], axis=1)
+    return found, valid
+
+
+def _plane_array(plan: Plan, inputs):
+    planes, rest = plan.prologue(plan.model, inputs)
+    return jnp.stack([planes[name] for name in kernel.planes_of(plan.model)], axis=1), rest
+
+
+def _forward(plan: Plan, mask, inputs, direction, radiance, count):
+    height, width = mask.shape
+    mask, inputs = blocks.padded(mask), {k: blocks.padded(v) if v.ndim >= 2 else v for k, v in inputs.items()}
+    table = _light_table(direction, radiance, ladder(direction.shape[0], plan.chunk))
+    walk = _plan_walk(plan, mask, inputs["normal"], table, count)
+    on = walk.total >= 0
+
+    def step(i, image):
+        ids = lax.dynamic_slice_in_dim(walk.ids, i * walk.group, walk.group)
+        found, valid = stored(on, lambda ids: _read_inputs(inputs, mask, ids), ids)
+        planes, rest = stored(on, lambda found: _plane_array(plan, found), found)
+
+        def body(sums, numbers, rows):
+            _, colour = _unpack(rows)
+
+            def weigh(planes, rows):
+                light, _ = _unpack(rows)
+                return kernel.weights(plan.model, _forms(plan.model, planes, light), light)
+
+            return tuple(
+                _add_weighted(total, weight, colour)
+                for total, weight in zip(sums, stored(on, weigh, planes, rows), strict=True)
+            )
+
+        zero = jnp.zeros((walk.group, 3, blocks.PIXELS), planes.dtype)
+        box = tuple(lax.dynamic_slice_in_dim(a, i * walk.group, walk.group, axis=1) for a in (walk.low, walk.high))
+        sums = _light_loop(plan, box, table, count, body, (zero,) * kernel.COMPONENTS)
+        return blocks.write(image, ids, stored(on, lambda *a: jnp.where(valid, plan.epilogue(*a), 0), sums, rest))
+
+    image = jnp.zeros((*mask.shape, 3), radiance.dtype)
+    return lax.fori_loop(0, -(-walk.total // walk.group), step, image)[:height, :width]
+
+
+# ------------------------------------------------------------------------------------------- the adjoint
+
+
+def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, count, cotangent):
+    """Cotangents of the inputs in `wanted`, of "direction" and of "radiance", given that of the image."""
+    height, width = mask.shape
+    shapes = {name: value.shape for name, value in inputs.items()}
+    mask, cotangent = blocks.padded(mask), blocks.padded(cotangent)
+    inputs = {k: blocks.padded(v) if v.ndim >= 2 else v for k, v in inputs.items()}
+    table = _light_table(direction, radiance, ladder(direction.shape[0], plan.chunk))
+    walk = _plan_walk(plan, mask, inputs["normal"], table, count)
+    on = walk.total >= 0
+    lane = lax.iota(jnp.int32, walk.group)
+    moved = {plane for name, reached in plan.reach if name in wanted for plane in reached}
+    names = kernel.planes_of(plan.model)
+    pairs = kernel.terms(plan.model)
+    used = [form for form in pairs if "direction" in wanted or any(plane in moved for plane, _ in pairs[form])]
+    width_of = len(kernel.COEFFICIENTS)
+
+    def step(i, found):
+        images, constants, light_bar = found
+        ids = lax.dynamic_slice_in_dim(walk.ids, i * walk.group, walk.group)
+        pixels, valid = stored(on, lambda ids: _read_inputs(inputs, mask, ids), ids)
+        # The list's padding repeats a block, whose cotangent counts once: so the repetitions add 0 below.
+        fresh = (i * walk.group + lane < walk.total)[:, None, None]
+        given = jnp.where(valid & fresh, blocks.read(cotangent, ids), 0)
+        planes, rest = stored(on, lambda pixels: _plane_array(plan, pixels), pixels)
+        zero = jnp.zeros((walk.group, 3, blocks.PIXELS), planes.dtype)
+        sums = (zero,) * kernel.COMPONENTS
+        # The epilogue is linear in the sums, so their cotangents do not depend on them.
+        pull_sums = jax.vjp(lambda *sums: plan.epilogue(sums, rest), *sums)[1]
+        sums_bar = stored(on, lambda given: pull_sums(given), given)
+
+        def body(carry, numbers, rows):
+            sums, planes_bar, light_bar = carry
+            light, colour = _unpack(rows)
+
+            def logs(planes, rows):
+                light, _ = _unpack(rows)
+                at = kernel.meet(plan.model, _forms(plan.model, planes, light), light)
+                return kernel.logarithm(at.cos_half)
+
+            def weigh(planes, rows, log):
+                light, _ = _unpack(rows)
+                return kernel.weights(plan.model, _forms(plan.model, planes, light), light, log)
+
+            log = stored(on, logs, planes, rows)
+            weight = stored(on, weigh, planes, rows, log)
+            sums = tuple(_add_weighted(*pair, colour) for pair in zip(sums, weight, strict=True))
+
+            def derivatives(planes, rows, log, weight):
+                light, colour = _unpack(rows)
+                form = _forms(plan.model, planes, light)
+                along = tuple(sum(bar[:, None, c] * colour[:, :, c, None] for c in range(3)) for bar in sums_bar)
+                bar, w_bar = kernel.adjoint(plan.model, form, light, log, weight[:2], along)
+                return {name: bar[name] for name in used}, w_bar
+
+            if used:
+                forms_bar, w_bar = stored(on, derivatives, planes, rows, log, weight)
+                planes_bar = dict(planes_bar)
+                for form in used:
+                    for plane, coefficient in pairs[form]:
+                        if plane in moved:
+                            bar, factor = forms_bar[form], light[coefficient]
+                            planes_bar[plane] = planes_bar[plane] + sum(
+                                bar[:, b] * factor[:, b] for b in range(plan.chunk)
+                            )
+            light_bar = dict(light_bar)
+            if "radiance" in wanted:
+                shared = jnp.stack(
+                    [
+                        blocks.sum_pixels(sum(w * bar[:, None, c] for w, bar in zip(weight, sums_bar, strict=True)))
+                        for c in range(3)
+                    ],
+                    axis=-1,
+                )
+                light_bar["radiance"] = light_bar["radiance"].at[numbers].add(shared, mode="promise_in_bounds")
+            if "direction" in wanted:
+                columns = {name: jnp.zeros(numbers.shape, planes.dtype) for name in kernel.COEFFICIENTS}
+                columns["w"] = blocks.sum_pixels(w_bar)
+                for form in used:
+                    for plane, coefficient in pairs[form]:
+                        if coefficient != "one":
+                            of_plane = planes[:, None, names.index(plane)]
+                            columns[coefficient] += blocks.sum_pixels(forms_bar[form] * of_plane)
+                table_bar = jnp.stack([columns[name] for name in kernel.COEFFICIENTS], axis=-1)
+                light_bar["direction"] = light_bar["direction"].at[numbers].add(table_bar, mode="promise_in_bounds")
+            return sums, planes_bar, light_bar
+
+        planes_bar = {plane: zero[:, 0] for plane in moved}
+        box = tuple(lax.dynamic_slice_in_dim(a, i * walk.group, walk.group, axis=1) for a in (walk.low, walk.high))
+        sums, planes_bar, light_bar = _light_loop(plan, box, table, count, body, (sums, planes_bar, light_bar))
+
+        def finish(pixels, planes_bar, sums, given):
+            moving = {name: pixels[name] for name in images.keys() | constants.keys()}
+            (planes, rest), pull = jax.vjp(lambda moving: plan.prologue(plan.model, pixels | moving), moving)
+            rest_bar = jax.vjp(lambda rest: plan.epilogue(sums, rest), rest)[1](given)[0]
+            planes_bar = {name: planes_bar.get(name, jnp.zeros_like(value)) for name, value in planes.items()}
+            return {name: jnp.where(valid, bar, 0) for name, bar in pull((planes_bar, rest_bar))[0].items()}
+
+        bars = stored(on, finish, pixels, planes_bar, sums, given)
+        images = {name: blocks.add(image, ids, bars[name]) for name, image in images.items()}
+        constants = {name: value + jnp.sum(bars[name], axis=0) for name, value in constants.items()}
+        return images, constants, light_bar
+
+    dtype = radiance.dtype
+    images = {n: jnp.zeros((*mask.shape, *shapes[n][2:]), dtype) for n in wanted if len(shapes.get(n, ())) >= 2}
+    constants = {n: jnp.zeros((shapes[n][0], blocks.PIXELS), dtype) for n in wanted if len(shapes.get(n, ())) == 1}
+    lights_bar = {
+        n: jnp.zeros((table.shape[0], k), dtype) for n, k in (("radiance", 3), ("direction", width_of)) if n in wanted
+    }
+    images, constants, lights_bar = lax.fori_loop(
+        0, -(-walk.total // walk.group), step, (images, constants, lights_bar)
+    )
+    bars = {name: image[:height, :width] for name, image in images.items()}
+    bars |= {name: jnp.sum(value, axis=1) for name, value in constants.items()}
+    if "radiance" in wanted:
+        bars["radiance"] = lights_bar["radiance"][: len(radiance)]
+    if "direction" in wanted:
+        pull = jax.vjp(kernel.coefficients, direction)[1]
+        bars["direction"] = pull(lights_bar["direction"][: len(direction)])[0]
+    return bars
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def shade_image(plan: Plan, mask, inputs, direction, radiance, count):
+    """The sum over lights at every pixel of the mask, [H, W, 3]; 0 elsewhere and where an input is not finite.
+
+    mask: [H, W] bool. inputs: dict of images [H, W, C] and of constants [C]; "normal" is one of them. direction,
+    radiance: [N, 3]; of the N lights the first `count` shine.
+    Gradient: in inputs, direction, radiance; what is not perturbed is not computed.
+    """
+    return _forward(plan, mask, inputs, direction, radiance, count)
+
+
+def _shade_image_forward(plan, mask, inputs, direction, radiance, count):
+    perturbed = [n for n, v in (inputs | {"direction": direction, "radiance": radiance}).items() if v.perturbed]
+    mask, inputs, direction, radiance, count = jax.tree.map(
+        lambda leaf: leaf.value, (mask, inputs, direction, radiance, count), is_leaf=lambda x: hasattr(x, "perturbed")
+    )
+    saved = mask, inputs, direction, radiance, count, {name: None for name in perturbed}
+    return _forward(plan, mask, inputs, direction, radiance, count), saved
+
+
+def _shade_image_backward(plan, saved, cotangent):
+    mask, inputs, direction, radiance, count, perturbed = saved
+    nothing = (None, {name: None for name in inputs}, None, None, None)
+    if isinstance(cotangent, jax.custom_derivatives.SymbolicZero) or not perturbed:
+        return nothing
+    bars = _adjoint(plan, frozenset(perturbed), mask, inputs, direction, radiance, count, cotangent)
+    inputs_bar = {name: bars.get(name) for name in inputs}
+    return None, inputs_bar, bars.get("direction"), bars.get("radiance"), None
+
+
+shade_image.defvjp(_shade_image_forward, _shade_image_backward, symbolic_zeros=True)
