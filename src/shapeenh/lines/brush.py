@@ -26,7 +26,7 @@ from shapeenh.types import LineField, Profile
 
 FOOTPRINTS = ("disc", "ellipse")
 LARGEST_REACH = 64
-_CUT = 1e-3  # stamps fainter than this are none
+_CUT = 1e-3  # taken off all weights, so that stamps fainter than this are none
 _LADDER = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 
 
@@ -183,7 +183,7 @@ def _stamps(profile, field, brush, shading, noise):
         wobble = 2 * brush.wobble * (noise[..., 3] - 0.5)
     profile_width = safe_sqrt(safe_divide(jnp.maximum(height, 0), -profile.curvature))
     s = jnp.minimum(brush.width + brush.spread * profile_width, 64)
-    bell = jnp.maximum(jnp.exp(-0.5 * (distance / s) ** 2) - _CUT, 0)
+    bell = jnp.maximum(rise * jnp.exp(-0.5 * (distance / s) ** 2) - _CUT, 0)  # lambda exp(-d^2 / 2 s^2)
     radius = brush.radius * (1 - brush.grow + brush.grow * rise)
     usable = profile.valid & (radius > 1e-3)
     radius = jnp.where(usable, radius, 1)
@@ -191,8 +191,8 @@ def _stamps(profile, field, brush, shading, noise):
     # What a straight line of such stamps adds up to: its length times its width, or the footprint, if that is smaller.
     line, whole = 2 * radius * np.sqrt(2 * np.pi).item() * s, np.pi * radius * radius * brush.aspect
     total = line * whole / safe_hypot(line, whole)
-    weight = brush.flow * rise * (1 - smoothstep(0.3, 0.7, gaps)) * bell / total
-    weight = jnp.where(usable & (rise * bell > _CUT), weight, 0)
+    weight = brush.flow * (1 - smoothstep(0.3, 0.7, gaps)) * bell / total
+    weight = jnp.where(usable, weight, 0)
 
     theta_x, theta_y = field.direction[..., 0], field.direction[..., 1]
     color = jnp.broadcast_to(brush.color[:, None, None], (3, *height.shape))
@@ -293,8 +293,8 @@ def _draw_everywhere(profile, field, brush, shading, noise, image, *, function, 
         row, col = k // side, k % side
         x, y = (col - reach).astype(stamps.dtype), (reach - row).astype(stamps.dtype)
         planes = jnp.stack(jnp.broadcast_arrays(*_imprint(list(stamps), x, y, brush.aspect, image, function)))
-        here = lax.dynamic_slice(canvas, (0, row, col), (4, h, w))
-        return lax.dynamic_update_slice(canvas, here + planes, (0, row, col)), None
+        here = lax.dynamic_slice(canvas, (jnp.zeros_like(row), row, col), (4, h, w))
+        return lax.dynamic_update_slice(canvas, here + planes, (jnp.zeros_like(row), row, col)), None
 
     canvas = jnp.zeros((4, h + 2 * reach, w + 2 * reach), stamps.dtype)
     canvas, _ = lax.scan(add, canvas, jnp.arange(side * side, dtype=jnp.int32))

@@ -1,0 +1,265 @@
+"""Line fields of all kinds: what they are on known surfaces, smoothing, singularities, gradients, edge cases."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import shapeenh as se
+from shapeenh.lines import fields
+from shapeenh.stencils import links
+from shapeenh.types import GBuffer, replace
+from tests.reference import lines as reference
+from tests.reference.differences import assert_gradient
+
+SIZE = 48
+ROW, COL = np.mgrid[0:SIZE, 0:SIZE].astype(float)
+X, Y = COL - SIZE / 2 + 0.5, SIZE / 2 - 0.5 - ROW
+
+
+def fold(angle, sign):
+    """The G-buffer of a rounded roof (sign +1: a ridge towards the viewer) or gutter (-1) along a direction."""
+    across = -np.sin(angle) * X + np.cos(angle) * Y
+    slope = -sign * 0.8 * np.tanh(across / 3)
+    normal = np.stack([np.sin(angle) * slope, -np.cos(angle) * slope, np.ones_like(X)], -1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    depth = 100 + sign * 0.8 * 3 * np.log(np.cosh(across / 3))
+    position = np.stack([X, Y, -depth], -1)
+    arrays = [jnp.asarray(a, jnp.float32) for a in (depth, normal, position)]
+    return GBuffer(jnp.ones((SIZE, SIZE), bool), *arrays), across
+
+
+def disc_before_wall(gap=30.0, radius=14.0, wall=True):
+    """A flat disc in front of a flat wall (or of nothing)."""
+    inside = np.hypot(X, Y) < radius
+    depth = np.where(inside, 100.0, 100.0 + gap)
+    mask = np.ones_like(inside) if wall else inside
+    position = np.where(mask[..., None], np.stack([X, Y, -depth], -1), 0)
+    normal = np.where(mask[..., None], [0.0, 0.0, 1.0], 0)
+    arrays = [jnp.asarray(a, jnp.float32) for a in (np.where(mask, depth, 0), normal, position)]
+    return GBuffer(jnp.asarray(mask), *arrays)
+
+
+# ------------------------------------------------------------------------------------------- what the kinds find
+
+
+@pytest.mark.parametrize("angle", [0.6, np.pi / 2])
+@pytest.mark.parametrize(("kind", "other", "sign"), [("ridge", "valley", 1), ("valley", "ridge", -1)])
+def test_ridges_are_convex_and_valleys_concave(angle, kind, other, sign):
+    gbuffer, across = fold(angle, sign)
+    descriptor = se.describe(gbuffer)
+    found = se.fit_profile(se.line_field(kind, gbuffer, descriptor))
+    middle = X**2 + Y**2 < 15**2
+    near = middle & (np.abs(across) <= 2)
+    assert np.all(np.asarray(found.valid)[near])
+    field = se.line_field(kind, gbuffer, descriptor)
+    theta = np.asarray(field.direction)
+    # the direction is that of the curvature, across the fold; the skeleton is the fold
+    cosine = np.abs(-np.sin(angle) * theta[..., 0] + np.cos(angle) * theta[..., 1])
+    assert np.min(cosine[near]) > 0.999
+    arrow = np.sign(-np.sin(angle) * theta[..., 0] + np.cos(angle) * theta[..., 1])
+    assert np.max(np.abs(across + arrow * np.asarray(found.distance))[near]) < 0.35
+    hm = np.asarray(se.mean_curvature(descriptor.hessian))
+    assert np.all(sign * hm[near] < 0)
+    none = se.fit_profile(se.line_field(other, gbuffer, descriptor), least=1e-3)
+    assert not np.any(np.asarray(none.valid)[middle & (np.abs(across) < 4)])
+
+
+def test_heights_are_those_of_the_table():
+    gbuffer, _ = fold(0.6, 1)
+    d = se.describe(gbuffer)
+    k1, k2 = se.principal_curvatures(d.hessian)
+    height = {k: se.line_field(k, gbuffer, d, sigma=0.0).height for k in ("ridge", "valley", "surface")}
+    np.testing.assert_allclose(height["ridge"], -k2, atol=1e-6)
+    np.testing.assert_allclose(height["valley"], k1, atol=1e-6)
+    np.testing.assert_allclose(height["surface"], np.hypot(d.gradient[..., 0], d.gradient[..., 1]), atol=1e-6)
+    hm = np.asarray(se.mean_curvature(d.hessian))
+    expected = np.hypot(*np.gradient(hm))[4:-4, 4:-4]
+    inflection = np.asarray(se.line_field("inflection", gbuffer, d, sigma=0.0).height)[4:-4, 4:-4]
+    # ours averages 1:4:1 across, numpy does not: second order apart
+    np.testing.assert_allclose(inflection, expected, atol=0.05 * expected.max())
+
+
+def test_inflections_run_where_the_curvature_changes_sign():
+    across = Y
+    slope = np.cos(2 * np.pi * across / 32)  # curvature -sin: extremal variation at its zeros
+    normal = np.stack([np.zeros_like(X), -slope, np.ones_like(X)], -1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    gbuffer = se.gbuffer_from_normals(jnp.asarray(normal, jnp.float32), check=False)
+    found = se.fit_profile(se.line_field("inflection", gbuffer, se.describe(gbuffer)))
+    for line in (-16.0, 0.0, 16.0):
+        near = (np.abs(across - line) < 1.5) & (np.abs(X) < 16) & (np.abs(across) < 18)
+        assert np.all(np.asarray(found.valid)[near])
+        assert np.max(np.abs(np.abs(across - line) - np.abs(found.distance))[near]) < 0.3
+
+
+@pytest.mark.parametrize("wall", [True, False])
+def test_occlusion_lines_coincide_with_depth_steps(wall):
+    gbuffer = disc_before_wall(wall=wall)
+    field = se.line_field("occlusion", gbuffer, se.describe(gbuffer))
+    found = se.fit_profile(field, radius=3.0, least=0.05)
+    r = np.hypot(X, Y)
+    valid = np.asarray(found.valid)
+    assert np.all(valid[np.abs(r - 14) <= 1])
+    skeleton = valid & (np.abs(found.distance) <= 0.5)
+    assert np.max(np.abs(r[skeleton] - 14)) <= 1
+    # every pixel next to the step has a skeleton within a pixel of it
+    theta, d = np.asarray(field.direction), np.asarray(found.distance)
+    target = np.hypot(X + d * theta[..., 0], Y + d * theta[..., 1])
+    assert np.max(np.abs(target - 14)[valid & (np.abs(r - 14) <= 1)]) <= 1
+    assert not np.any(valid[np.abs(r - 14) > 5])
+
+
+def test_steep_smooth_slopes_are_no_occlusions():
+    gbuffer, _ = fold(0.6, 1)
+    field = se.line_field("occlusion", gbuffer, se.describe(gbuffer))
+    assert np.max(np.asarray(field.height)[6:-6, 6:-6]) < 1e-3
+
+
+def test_luminance_edges_without_geometry():
+    image = 0.5 + 0.4 * np.tanh((0.8 * X + 0.6 * Y - 3) / 3)
+    field = se.line_field("luminance", None, None, luminance=jnp.asarray(image, jnp.float32))
+    found = se.fit_profile(field, least=0.01)
+    across = 0.8 * X + 0.6 * Y - 3
+    near = (np.abs(across) < 2) & (np.abs(X) < 15) & (np.abs(Y) < 15)
+    assert np.all(np.asarray(found.valid)[near])
+    assert np.max(np.abs(np.abs(across) - np.abs(found.distance))[near]) < 0.35
+
+
+def test_planes_have_no_lines_of_any_kind():
+    tilted = np.broadcast_to(np.float32([0.3, -0.2, 0.933]), (SIZE, SIZE, 3))
+    depth = np.float32(100 + (0.3 * X - 0.2 * Y) / 0.933)
+    gbuffer = se.gbuffer_from_normals(jnp.asarray(tilted), depth=jnp.asarray(depth), check=False)
+    d = se.describe(gbuffer, sigma=1.0)
+    for kind in ("ridge", "valley", "inflection", "surface"):
+        assert not np.any(se.fit_profile(se.line_field(kind, gbuffer, d)).valid), kind
+
+
+# ------------------------------------------------------------------------------------------- singularities, smoothing
+
+
+def test_direction_singularity_equals_the_twin(rng):
+    angle = np.cumsum(rng.normal(size=(14, 15)) * 0.4, axis=0)
+    theta = np.stack([np.cos(angle), np.sin(angle)], -1)
+    mask = rng.random((14, 15)) < 0.8
+    field = se.make_line_field(np.ones((14, 15), np.float32), np.float32(theta), mask=mask)
+    expected = reference.direction_singularity(theta, mask)
+    np.testing.assert_allclose(field.singularity, expected, atol=1e-5)
+    assert np.all(np.asarray(field.singularity)[~mask] == 1)
+
+
+def test_silhouettes_are_singular_and_insulate():
+    silhouette = np.zeros((SIZE, SIZE), np.float32)
+    silhouette[:, 24] = 1
+    height = np.where(COL < 24, 1.0, 5.0).astype(np.float32)
+    theta = np.broadcast_to(np.float32([1, 0]), (SIZE, SIZE, 2))
+    field = se.make_line_field(height, theta, silhouette=silhouette, sigma=3.0)
+    np.testing.assert_array_equal(np.asarray(field.singularity)[:, 24], 1)
+    np.testing.assert_allclose(np.asarray(field.height)[:, :24], 1.0, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(field.height)[:, 25:], 5.0, atol=1e-5)
+
+
+def test_directions_are_smoothed_as_lines(rng):
+    """theta and -theta are the same: flipped pixel by pixel they neither cancel nor change the result."""
+    flip = np.where(rng.random((SIZE, SIZE)) < 0.5, -1, 1).astype(np.float32)[..., None]
+    angle = 0.5 + 0.3 * rng.normal(size=(SIZE, SIZE))
+    theta = np.float32(np.stack([np.cos(angle), np.sin(angle)], -1))
+    height = np.float32(1 + 0.2 * np.sin(X / 4))
+    a = se.make_line_field(height, theta, sigma=2.0)
+    b = se.make_line_field(height, theta * flip, sigma=2.0)
+    np.testing.assert_allclose(a.height, b.height, atol=1e-6)
+    np.testing.assert_allclose(np.abs(np.sum(np.asarray(a.direction) * b.direction, -1)), 1, atol=1e-5)
+    middle = np.asarray(a.direction)[8:-8, 8:-8]
+    assert np.max(np.abs(np.arctan2(middle[..., 1], middle[..., 0]) - 0.5)) < 0.3
+    np.testing.assert_allclose(np.linalg.norm(a.direction, axis=-1), 1, atol=1e-5)
+
+
+def test_diffusion_conserves_and_is_a_gaussian():
+    spike = np.zeros((1, 41, 41), np.float32)
+    spike[0, 20, 20] = 1
+    link_x, link_y = links(jnp.ones((41, 41), jnp.float32))
+    out = np.asarray(fields.diffuse(jnp.asarray(spike), link_x, link_y, jnp.float32(0.5 * 3.0**2)))[0]
+    offset = np.arange(41) - 20.0
+    assert abs(out.sum() - 1) < 1e-5
+    assert abs((out.sum(0) * offset**2).sum() - 9) < 0.02
+
+
+def test_diffusion_has_the_gradient_of_its_differences(x64, rng):
+    link_x, link_y = links(jnp.asarray(rng.random((7, 8))))
+    planes, weights = jnp.asarray(rng.normal(size=(2, 7, 8))), jnp.asarray(rng.normal(size=(2, 7, 8)))
+    value = lambda p, t: jnp.sum(weights * fields.diffuse(p, link_x, link_y, t))  # noqa: E731
+    assert_gradient(jax.jit(lambda p: value(p, 0.93)), planes, directions=2)
+    assert_gradient(jax.jit(lambda t: value(planes, t)), jnp.asarray(0.93), directions=1)
+
+
+# ------------------------------------------------------------------------------------------- gradients, edge cases
+
+
+def test_gradient_of_height_and_direction(x64, rng):
+    smooth = np.cumsum(np.cumsum(rng.normal(size=(10, 11, 3)), 0), 1) * 0.02
+    d = se.Descriptor(
+        hessian=jnp.asarray(smooth),
+        gradient=jnp.asarray(rng.normal(size=(10, 11, 2))),
+        **{k: jnp.full((10, 11), v) for k, v in (("silhouette", 0.0), ("crease", 0.0), ("conductance", 1.0))},
+    )
+    gbuffer = GBuffer(*(jnp.ones((10, 11, *s)) for s in ((), (), (3,), (3,))))
+    gbuffer = replace(gbuffer, mask=gbuffer.mask > 0)
+    w = jnp.asarray(rng.normal(size=(10, 11, 3)))
+
+    def value(hessian):
+        field = se.line_field("ridge", gbuffer, replace(d, hessian=hessian), sigma=1.2)
+        x, y = field.direction[..., 0], field.direction[..., 1]
+        return jnp.sum(w[..., 0] * field.height + w[..., 1] * x * y + w[..., 2] * x * x)
+
+    assert_gradient(jax.jit(value), d.hessian, rtol=1e-5, directions=2)
+
+
+SLOWER = [pytest.param(k, marks=pytest.mark.slow) for k in ("surface", "luminance", "ridge", "inflection")]
+
+
+@pytest.mark.parametrize("kind", ["occlusion", "valley", *SLOWER])
+def test_gradients_are_finite_and_the_mask_is_kept(kind):
+    gbuffer = disc_before_wall(wall=False)
+    normal = jnp.where(gbuffer.mask[..., None], gbuffer.normal, jnp.nan)
+    d = se.describe(replace(gbuffer, normal=normal))
+    image = {"luminance": gbuffer.depth} if kind == "luminance" else {}
+
+    def value(hessian):
+        field = se.line_field(kind, gbuffer, replace(d, hessian=hessian), **image)
+        return jnp.sum(field.height) + jnp.sum(field.direction) + jnp.sum(field.singularity)
+
+    assert np.all(np.isfinite(jax.grad(value)(d.hessian)))
+    field = se.line_field(kind, gbuffer, d, **image)
+    assert all(np.all(np.isfinite(a)) for a in (field.height, field.direction, field.singularity))
+    off = ~np.asarray(gbuffer.mask)
+    if kind != "occlusion":
+        assert not np.any(np.asarray(field.height)[off])
+        assert not np.any(np.asarray(field.direction)[off])
+        assert np.all(np.asarray(field.singularity)[off] == 1)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (6, 1)])
+def test_thin_images(shape):
+    height = np.ones(shape, np.float32)
+    field = se.make_line_field(height, np.zeros((*shape, 2), np.float32), sigma=1.0)
+    assert np.all(np.isfinite(field.height))
+    assert not np.any(se.fit_profile(field).valid)
+    field = se.line_field("luminance", None, None, luminance=height)
+    assert np.all(np.isfinite(field.singularity))
+
+
+def test_bad_arguments_are_named():
+    gbuffer, _ = fold(0.0, 1)
+    d = se.describe(gbuffer)
+    with pytest.raises(ValueError, match="kind is 'crest'; accepted are 'occlusion'"):
+        se.line_field("crest", gbuffer, d)
+    with pytest.raises(ValueError, match="luminance is not given"):
+        se.line_field("luminance", gbuffer, d)
+    with pytest.raises(ValueError, match="luminance is given"):
+        se.line_field("ridge", gbuffer, d, luminance=gbuffer.depth)
+    with pytest.raises(ValueError, match="sigma"):
+        se.line_field("ridge", gbuffer, d, sigma=-1.0)
+    with pytest.raises(ValueError, match="accepted is a GBuffer"):
+        se.line_field("ridge", None, d)
+    with pytest.raises(ValueError, match="direction has shape"):
+        se.make_line_field(np.ones((4, 5)), np.ones((5, 4, 2)))
