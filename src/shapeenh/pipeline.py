@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from shapeenh.buffers.gbuffer import render_gbuffer
 from shapeenh.checks import check_range, check_type
 from shapeenh.descriptor.view import describe
-from shapeenh.light.radiance import shade, shade_warped
+from shapeenh.light.radiance import shade, shade_scaled, shade_warped
 from shapeenh.scene.environment import rotate_lights
 from shapeenh.types import (
     Camera,
@@ -116,8 +116,6 @@ def illuminate(
         alpha = jnp.asarray(enhancement.alpha) * scale
         return shade_warped(gbuffer, descriptor, lights, material, alpha=alpha, gamma=enhancement.gamma)
     if isinstance(enhancement, RadianceScaling):
-        from shapeenh.light.radiance import shade_scaled
-
         return shade_scaled(
             gbuffer,
             replace(descriptor, hessian=descriptor.hessian * scale),  # curvature as a picture of 600 px would show it
