@@ -6,11 +6,11 @@ import argparse
 import sys
 import warnings
 
-from shapeenh.cli import render
+from shapeenh.cli import fit, lines, render
 from shapeenh.cli.terminal import one_line, show_warning, use_compilation_cache
 from shapeenh.cli.values import UsageError
 
-COMMANDS = (render,)
+COMMANDS = (render, lines, fit)
 
 
 class _Parser(argparse.ArgumentParser):
