@@ -34,7 +34,7 @@ from shapeenh.buffers.runs import (
     table_rows,
     write_runs,
 )
-from shapeenh.buffers.xla import stored, take
+from shapeenh.buffers.xla import stored, take, unknown_truth
 
 OUTSIDE = 1 / 64  # how far outside a weight may be before it is held at the face's edge
 
@@ -102,7 +102,7 @@ def prepare(position, tables, faces, ids):
 def forward(finish, position, tables, view, m, faces, ids):
     height, width = ids.shape
     dtype = position.dtype
-    always = faces[0, 0] >= np.iinfo(np.int32).min
+    always = unknown_truth(position, view, m, faces, ids)
     flat, group, runs, total, packed, flat_faces = prepare(position, tables, faces, ids)
     size = flat.size
 
@@ -166,7 +166,7 @@ def backward(finish, position, tables, view, m, faces, ids, cotangents):
     """Recompute each group, and add one row of [position, attributes] per corner and pixel into the sums."""
     height, width = ids.shape
     dtype = position.dtype
-    always = faces[0, 0] >= np.iinfo(np.int32).min
+    always = unknown_truth(position, view, m, faces, ids)
     flat, group, runs, total, packed, flat_faces = prepare(position, tables, faces, ids)
     size = flat.size
     counts = [t.shape[-1] for t in cotangents]

@@ -15,7 +15,7 @@ from jax import lax
 
 from shapeenh.buffers.project import BEHIND, FAR_OFF, GUARD, ONE, SUB, faces_viewer, nearness, three, top_left
 from shapeenh.buffers.windows import merge, window_keys
-from shapeenh.buffers.xla import stored, take
+from shapeenh.buffers.xla import stored, take, unknown_truth
 
 TILE = 8
 BITS = TILE.bit_length() - 1
@@ -133,7 +133,7 @@ def nearness_range(xyr, near, shift):
 
 def draw_tiles(keys, vertices, face, index, xyr, even, valid, m, near, shift, *, height, width, cull, stride):
     """Faces [n] with corner indices [3, n] (ascending) and corners xyr [3, 3, n], drawn into the keys."""
-    always = vertices[0, 0] == vertices[0, 0]
+    always = unknown_truth(vertices, m, face)
     m, wide_near, wide_shift = cast(m, F64), cast(near, F64), cast(shift, F64)
 
     def points(index, xyr, m, near, shift):

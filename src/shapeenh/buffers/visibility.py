@@ -28,7 +28,7 @@ from shapeenh.buffers.windows import (
     window_keys,
     window_origin,
 )
-from shapeenh.buffers.xla import stored, take
+from shapeenh.buffers.xla import stored, take, unknown_truth
 from shapeenh.types import Camera, Mesh, Visibility
 
 CHUNK = 4096  # faces per step
@@ -87,7 +87,7 @@ def visible_triangles(vertices, faces, view, projection, *, height, width, cull)
 def draw(vertices, faces, m, near, height, width, cull):
     """triangle [height, width]: the whole rasteriser, for at least one face."""
     count = faces.shape[0]
-    always = faces[0, 0] >= np.iinfo(np.int32).min
+    always = unknown_truth(vertices, m, faces)
     with jax.enable_x64(True):  # 64-bit keys, whatever the caller's precision
         corners = stored(always, lambda v, m, near: project(v, m, near, height, width), vertices, m, near)
         shift = nearness_shift(corners)

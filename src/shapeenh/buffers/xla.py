@@ -16,6 +16,21 @@ def take(array, index):
     return array.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
+def unknown_truth(*arrays):
+    """True, but not for the compiler, as long as one of the (non-empty) arrays is not a constant of the program.
+
+    From all of them, because somebody's jit may close over some: then they are constants, and a border that rests on
+    one of those alone is folded away.
+    """
+    total = jnp.int32(0)
+    for array in arrays:
+        first = array[(0,) * array.ndim]
+        if jnp.issubdtype(first.dtype, jnp.floating):
+            first = lax.bitcast_convert_type(lax.convert_element_type(first, jnp.float32), jnp.int32)
+        total = total + lax.convert_element_type(first, jnp.int32)
+    return total >= jnp.iinfo(jnp.int32).min
+
+
 def stored(always, function, *args):
     """Evaluate `function` once and store what it returns.
 
