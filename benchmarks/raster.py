@@ -119,9 +119,8 @@ def main() -> None:
             covered = float(jnp.mean(se.rasterize(mesh, camera, height=height, width=width).triangle >= 0))
             calls = {**scene_calls(mesh, camera, height, width), **peers(mesh, camera, height, width)}
             for call, times in measure(calls, repeats=options.repeats).items():
-                rows.append(
-                    {"mesh": name, "size": size, "covered": round(covered, 2), "call": call, **times, "MiB": mib}
-                )
+                about = {"mesh": name, "size": size, "covered": round(covered, 2), "call": call}
+                rows.append({**about, **times, "ids_compile_s": round(seconds, 2), "ids_MiB": round(mib, 1)})
             print(table(rows[-len(calls) :]), flush=True)
     print(table(rows))
     print(write("raster", rows))
