@@ -1,5 +1,7 @@
 """Contrast, and parameters fitted to it or to a picture (SPEC 12)."""
 
+import json
+import re
 import subprocess
 import sys
 
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 
 import shapeenh as se
+from shapeenh.cli import main
 from shapeenh.fit.box import Box
 from shapeenh.fit.search import shortest_step, survey_points
 from tests.reference import contrast as twin
@@ -607,3 +610,52 @@ def test_importing_the_package_loads_no_solver_and_warns_of_nothing():
     code = "import sys, shapeenh; print(sorted({'jaxopt', 'optax'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
     assert done.stdout.strip() == "[]", done.stderr
+
+
+# ------------------------------------------------------------------------------------------- command line
+
+
+def test_shapeenh_fit_finds_draws_and_prints(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    small = ["--size", "64x48", "--lights", "8", "--samples", "1", "-o", str(tmp_path / "o.png")]
+    assert main(["fit", "--target-contrast", "0.82", "--fit", "gamma", "--json", *small]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["alpha"] == 30  # held
+    assert found["contrast"] == pytest.approx(0.82, rel=1e-3)
+    assert found["converged"] is True
+    picture = se.load_image(tmp_path / "o.png")
+    assert picture.shape == (48, 128, 3)
+    assert np.abs(picture[:, :64].astype(int) - picture[:, 64:]).max() > 5
+
+    knot = se.carved_knot()  # the same, by hand
+    gbuffer = se.render_gbuffer(
+        knot,
+        camera := se.frame_mesh(knot, direction=(0.33036, 0.258819, 0.907673), fov_degrees=30, aspect=4 / 3),
+        height=48,
+        width=64,
+    )
+    lights = se.rotate_lights(se.sample_environment(se.procedural_studio(), 8), camera)
+    warp = se.LightWarp(30.0, found["gamma"])
+    image = se.enhance(gbuffer, lights, se.named_material("stone"), warp, sigma=2.0, creases=70.0)
+    assert se.contrast(image, gbuffer.mask) == pytest.approx(0.82, rel=2e-3)
+
+    assert main(["fit", "--target-contrast", "0.82", *small]) == 0
+    assert re.match(r"alpha [\d.]+, gamma [\d.-]+: rms contrast 0\.82", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--target-contrast", "-1"], "--target-contrast is -1"),
+        (["--target-contrast", "9"], "accepted are the contrasts that can be reached"),
+        (["--target-contrast", "0.5", "--alpha", "300"], "--alpha is 300"),
+        (["--target-contrast", "0.5", "--measure", "weber"], "weber"),
+        ([], "--target-contrast"),
+    ],
+)
+def test_shapeenh_fit_names_bad_input(options, words, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    small = ["--size", "64x48", "--lights", "8", "--samples", "1", "-o", str(tmp_path / "o.png")]
+    assert main(["fit", *options, *small]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "o.png").exists()

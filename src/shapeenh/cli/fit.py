@@ -12,6 +12,7 @@ from shapeenh.cli.terminal import Stopwatch
 from shapeenh.cli.values import UsageError
 from shapeenh.fit.contrast import MEASURES, contrast
 from shapeenh.fit.to_contrast import fit_contrast
+from shapeenh.style import tone
 from shapeenh.types import LightWarp
 
 NAMES = ("alpha", "gamma")
@@ -45,17 +46,11 @@ def run(arguments) -> None:
     _check(arguments)
     clock = Stopwatch(repeat=False)
     loaded = scene.load(arguments, clock)
-    gbuffer = clock.stage("G-buffer", lambda: loaded.gbuffer(1))
+    gbuffer, picture = _prepare(loaded, arguments, clock, 1)
     mask = np.asarray(gbuffer.mask)
     if not mask.any():
         raise UsageError("nothing is seen: the picture is empty; accepted is an input that covers at least one pixel")
-    descriptor = clock.stage("descriptor", lambda: render.described(gbuffer, arguments))
-
-    def picture(warp):
-        return pipeline.illuminate(gbuffer, descriptor, loaded.lights, loaded.material, warp)
-
     bounds = {"alpha": (0.0, arguments.max_alpha), "gamma": (-1.0, 1.0)}
-    names = NAMES if arguments.fit == "both" else (arguments.fit,)
     found = clock.once(
         "fit",
         lambda: fit_contrast(
@@ -63,14 +58,26 @@ def run(arguments) -> None:
             arguments.target_contrast,
             LightWarp(alpha=arguments.alpha, gamma=arguments.gamma),
             mask=mask,
-            bounds={name: bounds[name] for name in names},
+            bounds={name: bounds[name] for name in (NAMES if arguments.fit == "both" else (arguments.fit,))},
             measure=arguments.measure,
         ),
     )
     original = float(contrast(picture(None), mask, measure=arguments.measure))
-    panels = render.panels(loaded, arguments, [None, found.parameters], clock)
-    clock.once("save", lambda: io.save_image(arguments.output, np.concatenate(panels, axis=1)))
+    samples = loaded.samples
+    if samples > 1:
+        gbuffer, picture = _prepare(loaded, arguments, clock, samples)
+    plain, warped = picture(None), picture(found.parameters)
+    exposure = tone.auto_exposure(plain, gbuffer.mask)
+    shown = render.side_by_side([plain, warped], exposure, gbuffer.mask, arguments, samples)
+    clock.once("save", lambda: io.save_image(arguments.output, shown))
     _report(arguments, found, original)
+
+
+def _prepare(loaded, arguments, clock, samples: int):
+    """(G-buffer, warp -> picture): what does not depend on the warp is computed once."""
+    gbuffer = clock.stage("G-buffer", lambda: loaded.gbuffer(samples))
+    descriptor = clock.stage("descriptor", lambda: render.described(gbuffer, arguments))
+    return gbuffer, lambda warp: pipeline.illuminate(gbuffer, descriptor, loaded.lights, loaded.material, warp)
 
 
 def _check(arguments) -> None:

@@ -45,21 +45,17 @@ def run(arguments) -> None:
     warp = LightWarp(alpha=arguments.alpha, gamma=arguments.gamma)
 
     gbuffer = clock.stage("G-buffer", lambda: loaded.gbuffer(samples))
-    descriptor = clock.stage("descriptor", lambda: _describe(gbuffer, arguments))
+    descriptor = clock.stage("descriptor", lambda: described(gbuffer, arguments))
     plain = clock.stage("shade", lambda: pipeline.illuminate(gbuffer, descriptor, lights, material, None))
     warped = clock.stage("shade warped", lambda: pipeline.illuminate(gbuffer, descriptor, lights, material, warp))
 
-    # Both are exposed alike; the samples of a pixel are averaged after the tone curve, as a display shows them.
     exposure = tone.auto_exposure(plain, gbuffer.mask)
-    panels = [
-        _average(tone.composite(tone.tone_map(p, exposure=exposure), gbuffer.mask, arguments.background), samples)
-        for p in ([warped] if arguments.only else [plain, warped])
-    ]
-    clock.once("save", lambda: io.save_image(arguments.output, np.concatenate(panels, axis=1)))
+    shown = side_by_side([warped] if arguments.only else [plain, warped], exposure, gbuffer.mask, arguments, samples)
+    clock.once("save", lambda: io.save_image(arguments.output, shown))
     if arguments.buffers is not None:
         if samples > 1:  # the numbers are those of pixel centres, not averages
             gbuffer = loaded.gbuffer(1)
-            descriptor = _describe(gbuffer, arguments)
+            descriptor = described(gbuffer, arguments)
         clock.once("save buffers", lambda: _save_buffers(Path(arguments.buffers), gbuffer, descriptor))
     if arguments.json is not None:
         _write_json(arguments, clock, loaded, gbuffer, exposure)
@@ -76,10 +72,17 @@ def _check(arguments) -> None:
         values.check_folder(Path(arguments.json).parent, "--json folder")
 
 
-def _describe(gbuffer, arguments):
+def described(gbuffer, arguments):
     """The descriptor at the scale that the user set for 600 px; sharp edges of the mesh insulate it."""
     scale = gbuffer.mask.shape[0] / pipeline.REFERENCE_HEIGHT
     return describe(gbuffer, sigma=min(arguments.sigma * scale, 100.0), creases=arguments.crease)
+
+
+def side_by_side(pictures, exposure, mask, arguments, samples: int) -> np.ndarray:
+    """One image for a display. All are exposed alike; samples are averaged after the tone curve, as they are seen."""
+    mapped = [tone.tone_map(picture, exposure=exposure) for picture in pictures]
+    panels = [_average(tone.composite(picture, mask, arguments.background), samples) for picture in mapped]
+    return np.concatenate(panels, axis=1)
 
 
 def _average(image, samples: int) -> np.ndarray:
