@@ -73,3 +73,38 @@ def shade_warped(normal, hessian, direction, radiance, diffuse, specular, shinin
     k, _ = principal(hessian)
     contrast = np.prod(factor(k, np.asarray(alpha)[..., None]), -1) ** gamma
     return total * contrast[..., None]
+
+
+def radiance_scale(kappa, delta, a, gamma):
+    """TH10 eq. 5.5 as printed; it cancels in float32, which is why the package writes it differently."""
+    e = np.exp(gamma * kappa)
+    return (a * e + delta * (1 - a * (1 + e))) / (a + delta * (e - a * (1 + e)))
+
+
+def curvature_mapping(hessian, l, anisotropy):
+    """tanh of the mean curvature plus the half difference along the two principal directions."""
+    k, q = principal(hessian)
+    a, b, _ = _principal_frame(l, q)
+    half = 0.5 * (k[..., 0] - k[..., 1])
+    return np.tanh(0.5 * (k[..., 0] + k[..., 1]) + anisotropy * half * (a * a - b * b))
+
+
+def shade_scaled(normal, hessian, direction, radiance, diffuse, specular, shininess, a, gammas, anisotropy, alpha=0.0):
+    """TH10 5.3 light by light; with alpha the lights are warped, kappa and delta taken at the unwarped directions."""
+    n = np.asarray(normal, np.float64)
+    e = np.array([0.0, 0.0, 1.0])
+    total = np.zeros(n.shape)
+    for l2, colour in zip(np.asarray(direction, np.float64), np.asarray(radiance, np.float64), strict=True):
+        l2 = np.broadcast_to(l2, n.shape)
+        l = unwarp(l2, hessian, alpha)
+        nl, nl2 = np.sum(n * l, -1), np.sum(n * l2, -1)
+        h = (l + e) / np.linalg.norm(l + e, axis=-1, keepdims=True)
+        nh = np.sum(n * h, -1)
+        kappa = curvature_mapping(hessian, l, anisotropy)
+        parts = [ashikhmin_shirley(n, l, e, d, s, shininess) for d, s in ((diffuse, specular), (np.zeros(3), specular))]
+        both = [parts[0] - parts[1], parts[1]]
+        levels = [np.clip(nl, 0, 1), np.clip(nh, 0, 1)]
+        weight = np.where((nl > 0) & (nl2 > 0), nl * jacobian(l2, hessian, alpha), 0.0)
+        for part, level, gamma in zip(both, levels, gammas, strict=True):
+            total += part * (radiance_scale(kappa, level, a, gamma) * weight)[..., None] * colour
+    return total

@@ -22,10 +22,14 @@ def diffuse_lobe(cos_light, cos_view):
 
 
 def specular_lobe(cos_half, half_view, cos_light, cos_view, shininess):
-    """rho_s / F: `(eta + 1)/(8 pi) (n.h)^eta / ((h.e) max(n.l, n.e))`; 0 where n.h or a denominator is not positive."""
+    """rho_s / F: `(eta + 1)/(8 pi) (n.h)^eta / ((h.e) max(n.l, n.e))`.
+
+    The denominator is held above the fourth root of the least number (3e-10 in float32): its square, which the
+    derivative divides by, stays a number where light and viewer both graze the surface. 0 where n.h is not positive.
+    """
     peak = numerics.safe_power(cos_half, shininess) * (shininess + 1) / (8 * np.pi)
     below = half_view * jnp.maximum(cos_light, cos_view)
-    return jnp.where(below > 0, peak / jnp.where(below > 0, below, 1), 0)
+    return peak / jnp.maximum(below, np.finfo(below.dtype).tiny ** 0.25)
 
 
 def fresnel(specular, half_view):
@@ -57,9 +61,11 @@ def ashikhmin_shirley(normal, light, view, material):
     shininess = jnp.broadcast_to(jnp.asarray(material.shininess, dtype), shape[:-1])[..., None]
 
     cos_light, cos_view = _dot(n, l), _dot(n, e)
-    lit = (cos_light > 0) & (cos_view > 0)
+    # Opposite directions have no half vector; one that is all but zero has derivatives that are no numbers.
+    opposite = _dot(l + e, l + e) < np.finfo(dtype).tiny ** 0.5
+    lit = (cos_light > 0) & (cos_view > 0) & ~opposite
     cos_light, cos_view = jnp.where(lit, cos_light, 1), jnp.where(lit, cos_view, 1)
-    half = numerics.normalize(l + e)
+    half = numerics.normalize(jnp.where(lit, l + e, e))
     half_view = jnp.minimum(_dot(half, e), 1)
     rho = diffuse * (1 - specular) * diffuse_lobe(cos_light, cos_view) + fresnel(specular, half_view) * specular_lobe(
         jnp.minimum(_dot(n, half), 1), half_view, cos_light, cos_view, shininess
