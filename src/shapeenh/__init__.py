@@ -24,7 +24,7 @@ from shapeenh.fit.contrast import contrast
 from shapeenh.fit.picture import FitResult
 from shapeenh.fit.to_contrast import fit_contrast
 from shapeenh.fit.to_image import fit_image
-from shapeenh.io import load_environment, load_image, load_mesh, save_image
+from shapeenh.io import load_environment, load_height, load_image, load_mesh, load_points, save_image
 from shapeenh.light.brdf import ashikhmin_shirley
 from shapeenh.light.radiance import shade, shade_scaled, shade_warped
 from shapeenh.light.scaling import curvature_mapping, radiance_scale
@@ -102,8 +102,10 @@ __all__ = [
     "interpolate",
     "line_field",
     "load_environment",
+    "load_height",
     "load_image",
     "load_mesh",
+    "load_points",
     "make_line_field",
     "make_mesh",
     "mean_curvature",

@@ -307,6 +307,21 @@ def load_image(path, *, linear: bool = False) -> np.ndarray:
     return image
 
 
+def load_height(path) -> tuple[np.ndarray, tuple[float, float] | None, float | None]:
+    """Read a height field: (heights [h, w], cell size (dx, dy) or None, nodata value or None).
+
+    A GeoTIFF tells its cell size and nodata value; other images do not. Of several channels the first is taken.
+
+    Errors: FileNotFoundError; ValueError for an unreadable file.
+    """
+    image = load_image(path)
+    path = Path(path)
+    spacing, nodata = None, None
+    if path.suffix.lower() in (".tif", ".tiff"):
+        spacing, nodata = codecs.tiff_georeference(path.read_bytes())
+    return image if image.ndim == 2 else image[..., 0], spacing, nodata
+
+
 def save_image(path, image, *, bits: int = 8) -> None:
     """Write an image; the suffix says how.
 

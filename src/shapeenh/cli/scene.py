@@ -50,9 +50,9 @@ def add_arguments(parser) -> None:
     add("--fov", type=values.number, default=30.0, help="vertical field of view, degrees (default: 30)")
     add("--crease", type=values.number, default=70.0, metavar="DEG", help="sharper edges stay sharp (default: 70)")
     add("--samples", type=int, default=2, help="per pixel and axis, for smooth outlines: 1 to 4 (default: 2)")
-    add("--spacing", type=values.number, default=1.0, help="of a height field: world units per pixel (default: 1)")
+    add("--spacing", type=values.number, help="of a height field: world units per pixel (default: the file's, or 1)")
     add("--z-factor", type=values.number, default=1.0, help="of a height field: exaggeration (default: 1)")
-    add("--nodata", type=float, help="of a height field: the value that means 'no data', besides NaN")
+    add("--nodata", type=float, help="of a height field: what means 'no data', besides NaN (default: the file's)")
     add(
         "--green",
         choices=("up", "down"),
@@ -114,15 +114,15 @@ def _kind(arguments) -> str:
 
 
 def _from_image(arguments, kind: str) -> GBuffer:
-    image = io.load_image(arguments.input)
     if kind == "normals":
+        image = io.load_image(arguments.input)
         if image.ndim != 3:
             raise UsageError(f"{arguments.input} has one channel; accepted are normal maps of three")
-        return gbuffer_from_normals(image[..., :3], green=arguments.green)
-    if image.ndim == 3:
-        image = image[..., 0]
-    options = {"spacing": arguments.spacing, "z_factor": arguments.z_factor, "nodata": arguments.nodata}
-    return gbuffer_from_height(image, **options)
+        return gbuffer_from_normals(image, green=arguments.green)
+    heights, spacing, nodata = io.load_height(arguments.input)
+    spacing = arguments.spacing or spacing or 1.0
+    nodata = nodata if arguments.nodata is None else arguments.nodata
+    return gbuffer_from_height(heights, spacing=spacing, z_factor=arguments.z_factor, nodata=nodata)
 
 
 def _mesh(arguments) -> Mesh:
