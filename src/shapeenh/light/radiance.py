@@ -11,6 +11,7 @@ import numpy as np
 from shapeenh import checks
 from shapeenh.light import brdf, sums, warp
 from shapeenh.light.weights import Model, gain
+from shapeenh.stencils import stored
 from shapeenh.types import Descriptor, GBuffer, Lights, Material
 
 # ------------------------------------------------------------------------------------------- what a pixel brings
@@ -18,7 +19,7 @@ from shapeenh.types import Descriptor, GBuffer, Lights, Material
 # outside the sum; an epilogue applies the factors. Both are differentiated by JAX.
 
 
-def _prologue(model: Model, inputs):
+def _prologue(model: Model, inputs, on):
     normal = inputs["normal"]
     # A visible surface faces the viewer, but interpolated normals overshoot at the limb. There every reflectance is 0,
     # and a black rim would result; with |n_z| the limb continues the shading of the pixels before it.
@@ -32,8 +33,7 @@ def _prologue(model: Model, inputs):
         concave = inputs["concave"][:, 0]
     if model.warped:
         alpha = inputs["alpha"][:, 0]
-        tensor = warp.spectral(jnp.stack([xx, xy, yy], axis=-1), -alpha, -alpha * concave)  # L^-1
-        a, b, c = tensor[..., 0], tensor[..., 1], tensor[..., 2]
+        a, b, c = stored(on, _inverse_tensor, xx, xy, yy, -alpha, -alpha * concave)
         planes |= {"ux": a * nx + b * ny, "uy": b * nx + c * ny}
         planes |= {"qxx": a * a + b * b, "qxy": b * (a + c), "qyy": b * b + c * c}
         det = a * c - b * b
@@ -66,6 +66,11 @@ def _prologue(model: Model, inputs):
     facing = brdf.DIFFUSE * (1 - (1 - 0.5 * nz) ** 5) * factor
     peak = (inputs["shininess"] + 1) / (8 * np.pi) * factor[:, None]
     return planes, (diffuse * facing[:, None], specular * peak, (1 - specular) * peak)
+
+
+def _inverse_tensor(xx, xy, yy, convex, concave):
+    tensor = warp.spectral(jnp.stack([xx, xy, yy], axis=-1), convex, concave)
+    return tensor[..., 0], tensor[..., 1], tensor[..., 2]
 
 
 def _epilogue(totals, factors):

@@ -35,7 +35,8 @@ SPAN = 128  # lights whose visibility is decided at a time
 class Plan(NamedTuple):
     """What is summed; static. Inputs are dicts of planes, (block, channel, 64), by name.
 
-    prologue: model, inputs -> (planes of `kernel.planes_of(model)`, each (block, 64), rest), rest any pytree of arrays.
+    prologue: model, inputs, predicate for `stored` -> (planes of `kernel.planes_of(model)`, each (block, 64), rest),
+    rest any pytree of arrays.
     epilogue: (sums, rest) -> (block, 3, 64); sums are the three components' (block, 3, 64); linear in them.
     reach: which planes each input moves, so that derivatives nobody asks for are not computed.
     group, chunk: blocks per step and lights per step.
@@ -124,6 +125,25 @@ def _forms(model: kernel.Model, planes, light):
     return form
 
 
+def _weights(model: kernel.Model, on, planes, rows):
+    """(log(n.h), (A, B, C)), each (block, light, 64) and stored.
+
+    The logarithm apart: one kernel for it and one for the rest keep fewer values alive than a single one, and take a
+    tenth less time.
+    """
+
+    def log(planes, rows):
+        light, _ = _unpack(rows)
+        return kernel.logarithm(kernel.meet(model, _forms(model, planes, light), light).cos_half)
+
+    def weigh(planes, rows, log):
+        light, _ = _unpack(rows)
+        return kernel.weights(model, _forms(model, planes, light), light, log)
+
+    log = stored(on, log, planes, rows)
+    return log, stored(on, weigh, planes, rows, log)
+
+
 def _add_weighted(total, weight, colour):
     """total (block, channel, 64) + sum over lights of weight (block, light, 64) colour (block, light, channel)."""
     return total + sum(weight[:, b, None, :] * colour[:, b, :, None] for b in range(weight.shape[1]))
@@ -185,8 +205,8 @@ def _read_inputs(inputs, mask, ids):
     return found, valid
 
 
-def _plane_array(plan: Plan, inputs):
-    planes, rest = plan.prologue(plan.model, inputs)
+def _plane_array(plan: Plan, on, inputs):
+    planes, rest = plan.prologue(plan.model, inputs, on)
     return jnp.stack([planes[name] for name in kernel.planes_of(plan.model)], axis=1), rest
 
 
@@ -200,19 +220,12 @@ def _forward(plan: Plan, mask, inputs, direction, radiance, count):
     def step(i, image):
         ids = lax.dynamic_slice_in_dim(walk.ids, i * walk.group, walk.group)
         found, valid = stored(on, lambda ids: _read_inputs(inputs, mask, ids), ids)
-        planes, rest = stored(on, lambda found: _plane_array(plan, found), found)
+        planes, rest = stored(on, lambda found: _plane_array(plan, on, found), found)
 
         def body(sums, numbers, rows):
             _, colour = _unpack(rows)
-
-            def weigh(planes, rows):
-                light, _ = _unpack(rows)
-                return kernel.weights(plan.model, _forms(plan.model, planes, light), light)
-
-            return tuple(
-                _add_weighted(total, weight, colour)
-                for total, weight in zip(sums, stored(on, weigh, planes, rows), strict=True)
-            )
+            _, weight = _weights(plan.model, on, planes, rows)
+            return tuple(_add_weighted(*pair, colour) for pair in zip(sums, weight, strict=True))
 
         zero = jnp.zeros((walk.group, 3, blocks.PIXELS), planes.dtype)
         box = tuple(lax.dynamic_slice_in_dim(a, i * walk.group, walk.group, axis=1) for a in (walk.low, walk.high))
@@ -224,6 +237,18 @@ def _forward(plan: Plan, mask, inputs, direction, radiance, count):
 
 
 # ------------------------------------------------------------------------------------------- the adjoint
+
+
+def _products(weights, cotangents):
+    """Sums over pixels of weight (block, light, 64) cotangent (block, 3, 64), as (block, light, 3, 8), the last axis
+    still to be added up: eight lanes at a time, because a sum along the axis that is vectorised is not."""
+    total = 0
+    for k in range(0, blocks.PIXELS, blocks.SIDE):
+        part = slice(k, k + blocks.SIDE)
+        total = total + sum(
+            w[:, :, None, part] * bar[:, None, :, part] for w, bar in zip(weights, cotangents, strict=True)
+        )
+    return total
 
 
 def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, count, cotangent):
@@ -249,7 +274,7 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
         # The list's padding repeats a block, whose cotangent counts once: so the repetitions add 0 below.
         fresh = (i * walk.group + lane < walk.total)[:, None, None]
         given = jnp.where(valid & fresh, blocks.read(cotangent, ids), 0)
-        planes, rest = stored(on, lambda pixels: _plane_array(plan, pixels), pixels)
+        planes, rest = stored(on, lambda pixels: _plane_array(plan, on, pixels), pixels)
         zero = jnp.zeros((walk.group, 3, blocks.PIXELS), planes.dtype)
         sums = (zero,) * kernel.COMPONENTS
         # The epilogue is linear in the sums, so their cotangents do not depend on them.
@@ -260,17 +285,7 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
             sums, planes_bar, light_bar = carry
             light, colour = _unpack(rows)
 
-            def logs(planes, rows):
-                light, _ = _unpack(rows)
-                at = kernel.meet(plan.model, _forms(plan.model, planes, light), light)
-                return kernel.logarithm(at.cos_half)
-
-            def weigh(planes, rows, log):
-                light, _ = _unpack(rows)
-                return kernel.weights(plan.model, _forms(plan.model, planes, light), light, log)
-
-            log = stored(on, logs, planes, rows)
-            weight = stored(on, weigh, planes, rows, log)
+            log, weight = _weights(plan.model, on, planes, rows)
             sums = tuple(_add_weighted(*pair, colour) for pair in zip(sums, weight, strict=True))
 
             def derivatives(planes, rows, log, weight):
@@ -292,14 +307,10 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
                             )
             light_bar = dict(light_bar)
             if "radiance" in wanted:
-                shared = jnp.stack(
-                    [
-                        blocks.sum_pixels(sum(w * bar[:, None, c] for w, bar in zip(weight, sums_bar, strict=True)))
-                        for c in range(3)
-                    ],
-                    axis=-1,
+                shared = stored(on, lambda weight: _products(weight, sums_bar), weight)
+                light_bar["radiance"] = (
+                    light_bar["radiance"].at[numbers].add(jnp.sum(shared, axis=-1), mode="promise_in_bounds")
                 )
-                light_bar["radiance"] = light_bar["radiance"].at[numbers].add(shared, mode="promise_in_bounds")
             if "direction" in wanted:
                 columns = {name: jnp.zeros(numbers.shape, planes.dtype) for name in kernel.COEFFICIENTS}
                 columns["w"] = blocks.sum_pixels(w_bar)
@@ -318,7 +329,7 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
 
         def finish(pixels, planes_bar, sums, given):
             moving = {name: pixels[name] for name in images.keys() | constants.keys()}
-            (planes, rest), pull = jax.vjp(lambda moving: plan.prologue(plan.model, pixels | moving), moving)
+            (planes, rest), pull = jax.vjp(lambda moving: plan.prologue(plan.model, pixels | moving, on), moving)
             rest_bar = jax.vjp(lambda rest: plan.epilogue(sums, rest), rest)[1](given)[0]
             planes_bar = {name: planes_bar.get(name, jnp.zeros_like(value)) for name, value in planes.items()}
             return {name: jnp.where(valid, bar, 0) for name, bar in pull((planes_bar, rest_bar))[0].items()}
