@@ -19,8 +19,11 @@ def test_names_are_sorted_and_exist():
 
 def test_the_contract_is_there():
     wanted = """load_mesh load_environment save_image perspective_camera orthographic_camera frame_mesh rasterize
-    interpolate render_gbuffer describe mean_curvature gaussian_curvature principal_curvatures principal_directions warp_tensor warp
-    unwarp warp_jacobian ashikhmin_shirley sample_environment rotate_lights shade_warped shade render
+    interpolate render_gbuffer describe mean_curvature gaussian_curvature principal_curvatures principal_directions
+    warp_tensor warp unwarp warp_jacobian ashikhmin_shirley sample_environment rotate_lights shade_warped shade render
+    shade_scaled curvature_mapping radiance_scale gbuffer_from_normals gbuffer_from_height gbuffer_from_points
+    vertex_curvature describe_object describe_apparent describe_relief line_field fit_profile draw_lines
+    contrast fit_contrast
     LightWarp RadianceScaling Mesh Camera Visibility GBuffer Descriptor Lights Material LineField Profile"""
     assert set(wanted.split()) <= set(se.__all__)
 

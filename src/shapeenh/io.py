@@ -8,6 +8,7 @@ import logging
 import os
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -89,11 +90,13 @@ def load_points(path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
         raise ValueError(f"{path} holds no finite point; accepted is a cloud with at least one")
     if not good.all():
         warnings.warn(f"{path} holds {(~good).sum()} points that are NaN or infinite; they are dropped", stacklevel=2)
-    points, normals, colors = (None if a is None else a[good] for a in (points, normals, colors))
+    points = points[good]
+    normals, colors = (None if a is None else a[good] for a in (normals, colors))
     if normals is not None and not (np.linalg.norm(normals, axis=1) > 0).all():
         normals = None  # incomplete normals are estimated anew
     points = _recentred(path, points, np.arange(len(points)))
-    return tuple(None if a is None else np.asarray(a, np.float32) for a in (points, normals, colors))  # type: ignore
+    normals, colors = (None if a is None else np.asarray(a, np.float32) for a in (normals, colors))
+    return np.asarray(points, np.float32), normals, colors
 
 
 def _read_ply_points(path: Path):
@@ -105,17 +108,17 @@ def _read_ply_points(path: Path):
         raise
     except BaseException as error:  # trimesh lets whatever its parsers meet through
         raise ValueError(f"{path} cannot be read as a PLY point cloud: {_one_line(error)}") from None
-    if isinstance(cloud, trimesh.Scene):
-        cloud = next(iter(cloud.geometry.values()), None)
-    if cloud is None or len(getattr(cloud, "vertices", ())) == 0:
+    bodies = list(cloud.geometry.values()) if isinstance(cloud, trimesh.Scene) else [cloud]
+    body: Any = bodies[0] if bodies else None
+    if len(getattr(body, "vertices", ())) == 0:
         raise ValueError(f"{path} holds no points; accepted is a cloud with at least one")
-    points = np.asarray(cloud.vertices, np.float64)
-    rows = cloud.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    points = np.asarray(body.vertices, np.float64)
+    rows = body.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
     names = rows.dtype.names if getattr(rows, "dtype", None) is not None and rows.dtype.names else ()
     normals = None
     if {"nx", "ny", "nz"} <= set(names) and len(rows) == len(points):
         normals = np.nan_to_num(np.stack([np.asarray(rows[n], np.float64).reshape(-1) for n in ("nx", "ny", "nz")], -1))
-    rgb = getattr(cloud, "colors", None)
+    rgb = getattr(body, "colors", None)
     colors = None if rgb is None or len(rgb) != len(points) else codecs.srgb_decode(np.asarray(rgb)[:, :3] / 255)
     return points, normals, colors
 
@@ -181,7 +184,7 @@ def _concatenate(parts):
     offsets = np.cumsum([0] + [len(p[0]) for p in parts[:-1]])
     vertices = np.concatenate([p[0] for p in parts])
     faces = np.concatenate([p[1] + o for p, o in zip(parts, offsets, strict=True)])
-    joined = []
+    joined: list[np.ndarray | None] = []
     for k, fill, width in ((2, 0.0, 3), (3, 1.0, 3), (4, 0.0, 2)):
         if all(p[k] is None for p in parts):
             joined.append(None)

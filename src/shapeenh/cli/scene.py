@@ -120,9 +120,12 @@ def _from_image(arguments, kind: str) -> GBuffer:
             raise UsageError(f"{arguments.input} has one channel; accepted are normal maps of three")
         return gbuffer_from_normals(image, green=arguments.green)
     heights, spacing, nodata = io.load_height(arguments.input)
-    spacing = arguments.spacing or spacing or 1.0
-    nodata = nodata if arguments.nodata is None else arguments.nodata
-    return gbuffer_from_height(heights, spacing=spacing, z_factor=arguments.z_factor, nodata=nodata)
+    return gbuffer_from_height(
+        heights,
+        spacing=arguments.spacing or spacing or 1.0,
+        z_factor=arguments.z_factor,
+        nodata=nodata if arguments.nodata is None else arguments.nodata,
+    )
 
 
 def _mesh(arguments) -> Mesh:

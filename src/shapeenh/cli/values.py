@@ -46,8 +46,7 @@ def view(text: str) -> tuple[float, float]:
 
 def material(text: str) -> dict:
     if text in materials.PRESETS:
-        diffuse, specular, shininess = materials.PRESETS[text]
-        return {"diffuse": diffuse, "specular": specular, "shininess": shininess}
+        return dict(zip(("diffuse", "specular", "shininess"), materials.PRESETS[text], strict=True))
     try:
         diffuse, specular, shininess = (number(t) for t in text.split(","))
     except ValueError:

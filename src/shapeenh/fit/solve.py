@@ -101,6 +101,7 @@ def minimise(
     if solver == "adam":
         return _adam(on_host, start, limit, stepped)
     u, bounds = jnp.asarray(start), (jnp.zeros(len(start)), jnp.ones(len(start)))
+    tolerance = tolerance**0.5  # these two look at the gradient, which of a squared error falls as its root
     if solver == "lbfgsb":
         found, state = _jaxopt().LBFGSB(fun=traced, tol=tolerance, maxiter=limit).run(u, bounds, *arguments)
     elif solver == "projected":

@@ -232,7 +232,7 @@ def sample_environment(radiance_map, count, *, rotation=None, method="importance
     Source: SPEC 7; LW09 6.1; `median_cut` after Debevec 2005.
     radiance_map: [h, w, 3], linear RGB, >= 0. rotation: None; [3, 3], which turns the map's world into the scene's; or
     an angle [] in radians about world y (counter-clockwise seen from above).
-    *Static*: count, 1 to 32768; method, one of `"uniform"` (cells of equal solid angle), `"importance"` (strata of
+    *Static*: count, 1 to 1048576; method, one of `"uniform"` (cells of equal solid angle), `"importance"` (strata of
     equal energy), `"median_cut"` (cells cut where energy times size is largest). All are deterministic.
     Returns `Lights` in world directions; radiance sums to the map's integral over the sphere (to 1e-5 in float32); a
     light whose cell is dark has radiance 0.
@@ -243,7 +243,7 @@ def sample_environment(radiance_map, count, *, rotation=None, method="importance
     Errors: ValueError for another shape, count or method, a map without energy, or a rotation that is not finite.
     """
     checks.check_shape("radiance_map", radiance_map, (None, None, 3))
-    count = checks.check_size("count", count)
+    count = checks.check_size("count", count, high=1 << 20)
     checks.check_choice("method", method, tuple(_METHODS))
     dtype = checks.float_dtype(radiance_map)
     if checks.is_concrete(radiance_map):
@@ -257,8 +257,8 @@ def sample_environment(radiance_map, count, *, rotation=None, method="importance
                 UserWarning,
                 stacklevel=2,
             )
-        direction, radiance, _ = _host_lights(clean, count, method)
-        direction, radiance = jnp.asarray(direction, dtype), jnp.asarray(radiance, dtype)
+        host_direction, host_radiance, _ = _host_lights(clean, count, method)
+        direction, radiance = jnp.asarray(host_direction, dtype), jnp.asarray(host_radiance, dtype)
     else:
         direction, radiance = _traced_lights(jnp.asarray(radiance_map, dtype), count, method)
     if rotation is not None:

@@ -8,7 +8,6 @@ from shapeenh.checks import check_range, check_size
 from shapeenh.scene.mesh import make_mesh
 from shapeenh.types import Mesh
 
-
 TWIST = 6  # turns of the rope over the length of the knot; the mesh is twisted along, so that edges follow the strands
 
 
@@ -35,7 +34,7 @@ def carved_knot(*, detail: int = 2) -> Mesh:
 
 
 def _trefoil_frame(u):
-    """Centre line and a frame that closes without a jump: normals start from the knot's axis and stay across the curve."""
+    """Centre line and a frame across it that closes without a jump: normals start from the knot's axis."""
     curve = lambda t: np.stack(  # noqa: E731
         [(2 + np.cos(3 * t)) * np.cos(2 * t), (2 + np.cos(3 * t)) * np.sin(2 * t), 1.15 * np.sin(3 * t)], axis=-1
     )
