@@ -226,14 +226,15 @@ def _traced_backward(count: int, method: str, saved, cotangent):
 _traced_lights.defvjp(_traced_forward, _traced_backward)
 
 
-def sample_environment(radiance_map, count, *, rotation=None, method="importance"):
+def sample_environment(radiance_map, count, *, rotation=None, method="median_cut"):
     """Reduces a latitude-longitude radiance map to `count` directional lights.
 
     Source: SPEC 7; LW09 6.1; `median_cut` after Debevec 2005.
     radiance_map: [h, w, 3], linear RGB, >= 0. rotation: None; [3, 3], which turns the map's world into the scene's; or
     an angle [] in radians about world y (counter-clockwise seen from above).
     *Static*: count, 1 to 1048576; method, one of `"uniform"` (cells of equal solid angle), `"importance"` (strata of
-    equal energy), `"median_cut"` (cells cut where energy times size is largest). All are deterministic.
+    equal energy), `"median_cut"` (cells cut where energy times size is largest; at 54 lights a quarter to
+    two fifths less error than the others on average, `benchmarks/sampling.py`). All are deterministic.
     Returns `Lights` in world directions; radiance sums to the map's integral over the sphere (to 1e-5 in float32); a
     light whose cell is dark has radiance 0.
     Negative and NaN values count as 0, infinite ones as the largest finite value; one `UserWarning` says how many
