@@ -26,7 +26,11 @@ from shapeenh.fit.to_contrast import fit_contrast
 from shapeenh.fit.to_image import fit_image
 from shapeenh.io import load_environment, load_height, load_image, load_mesh, load_points, save_image
 from shapeenh.light.brdf import ashikhmin_shirley
+from shapeenh.light.lookup import environment_radiance, harmonic_radiance, prefilter_map, spherical_harmonics
+from shapeenh.light.occlusion import ambient_occlusion
+from shapeenh.light.phong import shade_phong
 from shapeenh.light.radiance import shade, shade_scaled, shade_warped
+from shapeenh.light.reflection import shade_diffuse, shade_forward, shade_mirror, shade_refraction
 from shapeenh.light.scaling import curvature_mapping, radiance_scale
 from shapeenh.light.warp import unwarp, warp, warp_jacobian, warp_tensor
 from shapeenh.lines.brush import Brush, composite_lines, draw_lines
@@ -41,6 +45,7 @@ from shapeenh.scene.environment import procedural_sky, procedural_studio, rotate
 from shapeenh.scene.materials import named_material
 from shapeenh.scene.mesh import make_mesh, vertex_normals
 from shapeenh.scene.shapes import carved_knot, plane, sphere, torus
+from shapeenh.style.lit_sphere import lit_sphere
 from shapeenh.style.tone import auto_exposure, composite, tone_map
 from shapeenh.types import (
     Camera,
@@ -70,6 +75,7 @@ __all__ = [
     "Profile",
     "RadianceScaling",
     "Visibility",
+    "ambient_occlusion",
     "apply_normal_map",
     "apply_texture",
     "ashikhmin_shirley",
@@ -89,6 +95,7 @@ __all__ = [
     "describe_relief",
     "draw_lines",
     "enhance",
+    "environment_radiance",
     "estimate_normals",
     "estimate_radius",
     "fit_contrast",
@@ -99,8 +106,10 @@ __all__ = [
     "gbuffer_from_height",
     "gbuffer_from_normals",
     "gbuffer_from_points",
+    "harmonic_radiance",
     "interpolate",
     "line_field",
+    "lit_sphere",
     "load_environment",
     "load_height",
     "load_image",
@@ -114,6 +123,7 @@ __all__ = [
     "pad_mesh",
     "perspective_camera",
     "plane",
+    "prefilter_map",
     "principal_curvatures",
     "principal_directions",
     "procedural_sky",
@@ -127,9 +137,15 @@ __all__ = [
     "sample_texture",
     "save_image",
     "shade",
+    "shade_diffuse",
+    "shade_forward",
+    "shade_mirror",
+    "shade_phong",
+    "shade_refraction",
     "shade_scaled",
     "shade_warped",
     "sphere",
+    "spherical_harmonics",
     "style_brush",
     "style_footprint",
     "surface_noise",
