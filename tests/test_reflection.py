@@ -190,6 +190,15 @@ def test_rotation_turns_the_map(x64, rng):
     np.testing.assert_allclose(got, se.environment_radiance(radiance, jnp.asarray(world)), rtol=1e-12)
 
 
+def test_diffuse_light_by_harmonics_is_close_to_the_map(x64, rng):
+    gbuffer, descriptor = ball(x64, rng)
+    radiance = smooth_map(x64)
+    tables = se.prefilter_map(radiance), se.spherical_harmonics(radiance)
+    for options in ({}, {"alpha": 20.0, "contrast": 0.5}, {"gamma": 1.0}):
+        a, b = (se.shade_diffuse(gbuffer, t, descriptor=descriptor, **options) for t in tables)
+        np.testing.assert_allclose(a, b, rtol=0.03, atol=1e-12)
+
+
 # ------------------------------------------------------------------------------------------- Phong
 
 

@@ -5,8 +5,10 @@ The map's convention is SPEC 7's: world y up, the map's middle along -z. Directi
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from shapeenh import checks, numerics
 
@@ -113,10 +115,16 @@ def prefilter_map(radiance_map, *, height=32):
     source, solid = _map_directions(*np.shape(radiance_map)[:2])
     target, _ = _map_directions(height, 2 * height)
     weighted = jnp.asarray(radiance_map, dtype) * jnp.asarray(solid, dtype)[..., None] / np.pi
-    source, target = (jnp.asarray(a.reshape(-1, 3), dtype) for a in (source, target))
-    cosine = jnp.maximum(jnp.matmul(target, source.T, precision="highest"), 0)
+    source, target = (jnp.asarray(a, dtype) for a in (source.reshape(-1, 3), target))
+    share = np.broadcast_to(solid / np.pi, np.shape(radiance_map)[:2]).reshape(-1, 1)
+    table = jnp.concatenate([weighted.reshape(-1, 3), jnp.asarray(share, dtype)], axis=-1)
+
+    @jax.checkpoint
+    def convolve(row):
+        # A row of the result at a time: all at once would be a table of the square of the map's size.
+        cosine = jnp.maximum(jnp.matmul(row, source.T, precision="highest"), 0)
+        return jnp.matmul(cosine, table, precision="highest")
+
+    out = lax.map(convolve, target)
     # Divided by the cosine's own quadrature, so that a constant map stays constant.
-    share = np.broadcast_to(solid / np.pi, np.shape(radiance_map)[:2])
-    whole = jnp.matmul(cosine, jnp.asarray(share.reshape(-1), dtype), precision="highest")
-    out = jnp.matmul(cosine, weighted.reshape(-1, 3), precision="highest") / whole[:, None]
-    return out.reshape(height, 2 * height, 3)
+    return out[..., :3] / out[..., 3:]
