@@ -36,3 +36,17 @@ def x64():
 @pytest.fixture
 def rng():
     return np.random.default_rng(20090803)
+
+
+@pytest.fixture
+def compilations():
+    """A list that grows by the name of every function that XLA compiles, `jit(f)`; clear it when warm."""
+    names = []
+
+    def listen(event, _, fun_name="", **__):
+        if event == "/jax/core/compile/backend_compile_duration":
+            names.append(fun_name)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield names
+    jax.monitoring.unregister_event_duration_listener(listen)

@@ -150,6 +150,15 @@ def test_contrast_of_any_picture_is_finite_and_so_is_its_gradient(image, bits, m
         assert value <= 1 + 1e-6
 
 
+def test_michelson_contrast_never_rounds_below_zero():
+    """Three counting pixels of one luminance, averaged with the weights of either end: high - low was -3.5e-8."""
+    image = np.zeros((2, 3, 3), np.float32)
+    image[1, 1] = 1, 0, 0
+    for bits in range(2**6):
+        mask = np.array([bits >> k & 1 for k in range(6)], bool).reshape(2, 3)
+        assert 0 <= float(se.contrast(image, mask, measure="michelson")) <= 1 + 1e-6
+
+
 def test_contrast_under_jit_and_vmap(rng):
     mask = disc()
     images = rng.uniform(0.1, 1, (3, *mask.shape)).astype(np.float32)

@@ -130,7 +130,7 @@ def test_gradients_against_central_differences(what, x64):
         assert_gradient(f, start, steps=(1e-5, 1e-6, 1e-7, 1e-8), directions=3)
 
 
-def test_values_do_not_recompile():
+def test_values_do_not_recompile(compilations):
     mesh, _, lights, material = scene()
 
     def picture(alpha, gamma, sigma, shift):
@@ -140,27 +140,10 @@ def test_values_do_not_recompile():
         return se.render(mesh, moved, lamps, stone, se.LightWarp(alpha, gamma), sigma=sigma, **SIZE)
 
     picture(20.0, 0.5, 1.0, 0.0)
-    with _count_compilations() as compiled:
-        picture(35.0, 0.25, 2.0, 0.1)
-        picture(50.0, 0.75, 3.0, 0.2)
-    assert compiled == []
-
-
-class _count_compilations:
-    """Names of the functions that XLA compiles while the context is open."""
-
-    def __enter__(self):
-        self.events = []
-        self.open = True
-        jax.monitoring.register_event_duration_secs_listener(self._listen)
-        return self.events
-
-    def _listen(self, event, duration, **_):
-        if self.open and event == "/jax/core/compile/backend_compile_duration":
-            self.events.append(event)
-
-    def __exit__(self, *_):
-        self.open = False
+    compilations.clear()
+    picture(35.0, 0.25, 2.0, 0.1)
+    picture(50.0, 0.75, 3.0, 0.2)
+    assert compilations == []
 
 
 @pytest.mark.parametrize(

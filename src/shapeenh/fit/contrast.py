@@ -61,7 +61,7 @@ def _contrast(image, mask, *, measure, scale):
     mean = _mean(y, counts)
     if measure == "michelson":
         high, low = _extremes(y, counts)
-        return safe_divide(high - low, high + low)
+        return safe_divide(jnp.where(high > low, high - low, 0), high + low)  # equal pixels may round below 0
     deviation = y - mean if measure == "rms" else _band(y, counts, scale)
     deviation = deviation - _mean(deviation, counts)  # what rounding left of the mean: a uniform picture has none
     return safe_divide(safe_sqrt(_mean(jnp.square(deviation), counts)), mean)
