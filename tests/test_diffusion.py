@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from shapeenh.descriptor import diffusion
+from shapeenh import heat
 from shapeenh.descriptor.diffusion import diffuse_stacks, levels_for
 from shapeenh.stencils import links
 from tests.reference import diffusion as reference
@@ -151,8 +151,20 @@ def test_reverse_mode_of_explicit_steps(x64, rng, budget):
     one = jnp.ones((1, 1))
     for time in (0.13, 3.45):
         b = jnp.full((1, 1), time) if budget == "one" else jnp.asarray(time * rng.random((6, 7)))
-        run = lambda *a: diffusion.explicit(*a, one, 0.2, (3, 3, 2))  # noqa: E731  several levels of kept states
+        run = lambda *a: heat.explicit(*a, one, 0.2, (3, 3, 2))  # noqa: E731  several levels of kept states
         check_grads(run, (u, link_x, link_y, b), order=1, modes=["rev"], rtol=1e-6, atol=1e-6)
+
+
+def test_reverse_mode_computes_only_what_is_asked_for(x64, rng):
+    """The same derivatives, whether or not those with respect to the links are computed with them."""
+    u, c = jnp.asarray(rng.standard_normal((2, 6, 7))), jnp.asarray(rng.random((6, 7)))
+    one, ct = jnp.ones((1, 1)), jnp.asarray(rng.standard_normal((2, 6, 7)))
+    for budget in (jnp.full((1, 1), 0.93), jnp.asarray(rng.random((6, 7))), jnp.zeros((1, 1))):
+        run = lambda u, x, y, b: jnp.vdot(ct, heat.explicit(u, x, y, b, one))  # noqa: E731
+        at = (u, *links(c), budget)
+        whole, some = jax.jit(jax.grad(run, (0, 1, 2, 3)))(*at), jax.jit(jax.grad(run, (0, 3)))(*at)
+        np.testing.assert_allclose(some[0], whole[0], atol=1e-14)
+        np.testing.assert_allclose(some[1], whole[3], atol=1e-14)
 
 
 def test_reverse_mode_of_the_fast_scheme(x64, rng):

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 import shapeenh as se
-from shapeenh.lines import fields
-from shapeenh.stencils import links
 from shapeenh.types import GBuffer, replace
 from tests.reference import lines as reference
 from tests.reference.differences import assert_gradient
@@ -172,24 +170,6 @@ def test_directions_are_smoothed_as_lines(rng):
     middle = np.asarray(a.direction)[8:-8, 8:-8]
     assert np.max(np.abs(np.arctan2(middle[..., 1], middle[..., 0]) - 0.5)) < 0.3
     np.testing.assert_allclose(np.linalg.norm(a.direction, axis=-1), 1, atol=1e-5)
-
-
-def test_diffusion_conserves_and_is_a_gaussian():
-    spike = np.zeros((1, 41, 41), np.float32)
-    spike[0, 20, 20] = 1
-    link_x, link_y = links(jnp.ones((41, 41), jnp.float32))
-    out = np.asarray(fields.diffuse(jnp.asarray(spike), link_x, link_y, jnp.float32(0.5 * 3.0**2)))[0]
-    offset = np.arange(41) - 20.0
-    assert abs(out.sum() - 1) < 1e-5
-    assert abs((out.sum(0) * offset**2).sum() - 9) < 0.02
-
-
-def test_diffusion_has_the_gradient_of_its_differences(x64, rng):
-    link_x, link_y = links(jnp.asarray(rng.random((7, 8))))
-    planes, weights = jnp.asarray(rng.normal(size=(2, 7, 8))), jnp.asarray(rng.normal(size=(2, 7, 8)))
-    value = lambda p, t: jnp.sum(weights * fields.diffuse(p, link_x, link_y, t))  # noqa: E731
-    assert_gradient(jax.jit(lambda p: value(p, 0.93)), planes, directions=2)
-    assert_gradient(jax.jit(lambda t: value(planes, t)), jnp.asarray(0.93), directions=1)
 
 
 # ------------------------------------------------------------------------------------------- gradients, edge cases

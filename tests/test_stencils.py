@@ -6,7 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shapeenh.stencils import derivatives, links, pair_mean, stored, unknown_truth
+from shapeenh.fusion import stored, unknown_truth
+from shapeenh.stencils import derivatives, links, pair_mean
 
 _derivatives = jax.jit(lambda u, c: derivatives(u, *links(c), unknown_truth(u)))
 

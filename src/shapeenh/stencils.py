@@ -7,34 +7,11 @@ between a pixel and its right neighbour (`link_x`, [H, W-1]) and its lower neigh
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 
+from shapeenh.fusion import stored
 from shapeenh.numerics import safe_divide
-
-
-def stored(always, function, *args):
-    """`function(*args)`, evaluated once and stored.
-
-    XLA re-fuses: it computes a producer again inside every consumer, and a stencil over a stencil over a logarithm is
-    20 times slower for it. A conditional on a predicate that is true but not known to be so is a border that fusion
-    does not cross (`optimization_barrier` is not).
-    """
-    shapes = jax.eval_shape(function, *args)
-
-    def never(*_):
-        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-
-    return lax.cond(always, function, never, *args)
-
-
-def unknown_truth(*arrays):
-    """True, but only at run time can that be seen: the `always` of `stored`, unless all arrays are constants."""
-    corners = [lax.stop_gradient(jnp.ravel(array)[0]) for array in arrays]
-    total = sum(jnp.where(jnp.abs(corner) < 1, corner, 0) for corner in corners)
-    return total < len(arrays)  # not a sum of squares >= 0, which would be folded
-
 
 # ------------------------------------------------------------------------------------------- neighbours
 

@@ -13,7 +13,8 @@ import numpy as np
 from jax import lax
 
 from shapeenh.buffers.project import BEHIND, double_area, faces_viewer, pixel_box, three
-from shapeenh.buffers.xla import lower_bound, stored, take
+from shapeenh.buffers.xla import lower_bound, take
+from shapeenh.fusion import stored
 
 WINDOWS = ((2, 2), (4, 4), (8, 8))  # rows, columns
 LARGE = len(WINDOWS) + 1

@@ -34,7 +34,8 @@ from shapeenh.buffers.runs import (
     table_rows,
     write_runs,
 )
-from shapeenh.buffers.xla import stored, take, unknown_truth
+from shapeenh.buffers.xla import take
+from shapeenh.fusion import stored, unknown_truth
 
 OUTSIDE = 1 / 64  # how far outside a weight may be before it is held at the face's edge
 

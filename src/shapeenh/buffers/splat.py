@@ -16,7 +16,8 @@ import numpy as np
 from jax import lax
 
 from shapeenh.buffers.pairs import LANES, TILE_H, TILE_W, from_tiles, lanes, tiling, walk
-from shapeenh.buffers.xla import stored, take
+from shapeenh.buffers.xla import take
+from shapeenh.fusion import stored
 from shapeenh.numerics import smoothstep
 
 GEOMETRY = 12  # columns of a disc: X, Y, W, depth, three each

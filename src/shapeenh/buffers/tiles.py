@@ -15,7 +15,8 @@ from jax import lax
 
 from shapeenh.buffers.project import BEHIND, FAR_OFF, GUARD, ONE, SUB, faces_viewer, nearness, three, top_left
 from shapeenh.buffers.windows import merge, window_keys
-from shapeenh.buffers.xla import stored, take, unknown_truth
+from shapeenh.buffers.xla import take
+from shapeenh.fusion import stored, unknown_truth
 
 TILE = 8
 BITS = TILE.bit_length() - 1

@@ -28,7 +28,8 @@ from shapeenh.buffers.windows import (
     window_keys,
     window_origin,
 )
-from shapeenh.buffers.xla import stored, take, unknown_truth
+from shapeenh.buffers.xla import take
+from shapeenh.fusion import stored, unknown_truth
 from shapeenh.types import Camera, Mesh, Visibility
 
 CHUNK = 4096  # faces per step

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from shapeenh.checks import check_shape, check_type
 from shapeenh.descriptor import edges, gradient
 from shapeenh.descriptor.view import check_gbuffer, describe
+from shapeenh.fusion import stored, unknown_truth
 from shapeenh.numerics import eigenvalues, safe_divide, safe_hypot, safe_sqrt
-from shapeenh.stencils import derivatives, links, stored, unknown_truth
+from shapeenh.stencils import derivatives, links
 from shapeenh.types import Camera, Descriptor
 
 # ------------------------------------------------------------------------------------------- object-centred

@@ -1,147 +1,23 @@
 """Anisotropic diffusion of image planes, dg/ds = div(c grad g) (Perona-Malik; LW09 4.3, SPEC 3.5 and 3.6).
 
-The semi-discrete operator is A g (p) = sum over the four neighbours q of l_pq (g_q - g_p), with the links l_pq of
-`stencils.links`. A is symmetric, its rows and columns sum to 0, its off-diagonal entries are not negative: hence the
-three laws (nothing crosses a closed link, the sum over a connected region stays, no new extrema). Both schemes below
-are made of averages with non-negative weights alone, and so keep them, step for step.
+Either explicit steps (`heat`), or the fast scheme. Both are made of averages with non-negative weights alone, and so
+keep the three laws step for step: nothing crosses a closed link, the sum over a connected region stays, no new extrema.
 
-Planes are `[C, H, W]`. Imports `stencils` only.
+Planes are `[C, H, W]`.
 """
 
 from __future__ import annotations
 
 import math
-from functools import partial
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 
-from shapeenh.stencils import shift, stored
-
-# ------------------------------------------------------------------------------------------- the operator
+from shapeenh.fusion import stored
+from shapeenh.heat import STEP, explicit, slots_for
+from shapeenh.stencils import shift
 
 GREATEST_SIGMA = 100.0
-STEP = 0.2  # at 1/4 a checkerboard would keep its amplitude (SPEC 3.5)
-
-
-def _jumps(planes):
-    """g(right) - g and g(below) - g, the differences across every link."""
-    return planes[:, :, 1:] - planes[:, :, :-1], planes[:, 1:] - planes[:, :-1]
-
-
-def divergence(planes, link_x, link_y):
-    """A g: what flows into every pixel per unit of time."""
-    jump_x, jump_y = _jumps(planes)
-    flow_x = jnp.pad(link_x[None] * jump_x, ((0, 0), (0, 0), (1, 1)))
-    flow_y = jnp.pad(link_y[None] * jump_y, ((0, 0), (1, 1), (0, 0)))
-    return flow_x[:, :, 1:] - flow_x[:, :, :-1] + flow_y[:, 1:] - flow_y[:, :-1]
-
-
-# ------------------------------------------------------------------------------------------- explicit steps
-
-
-def _share(budget, k, step):
-    """How much of its time budget a pixel spends in step k: a full step, a short last one, or 0."""
-    return jnp.clip(budget - k * step, 0, step)
-
-
-def _count(budget, step):
-    return jnp.ceil(jnp.max(budget) / step - 1e-6).astype(jnp.int32)
-
-
-def _forward(start, stop, planes, link_x, link_y, budget, weight, *, step):
-    def one(k, g):
-        return g + (_share(budget, k, step) * weight)[None] * divergence(g, link_x, link_y)
-
-    return lax.fori_loop(start, stop, one, planes)
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(5, 6))
-def explicit(planes, link_x, link_y, budget, weight, step=STEP, slots=(8, 8, 8, 8, 8)):
-    """`planes` after each pixel has spent its time `budget` in explicit steps (SPEC 3.5, 3.6).
-
-    planes: [C, H, W]; link_x: [H, W-1]; link_y: [H-1, W]; budget: [1, 1] or [H, W], time in px^2, sigma = sqrt(2 time).
-    weight: [1, 1] or [H, W], what a pixel makes of one unit of inflow (1, or 1/volume); no gradient.
-    *Static*: step, the longest step; slots, how many states the reverse sweep keeps per level, coarsest first: their
-        product bounds the number of steps that can be differentiated.
-    The number of steps is read at run time, so nothing recompiles when the budget changes; the last step is as
-    short as it has to be, so the result is continuous in the budget.
-    """
-    return _forward(0, _count(budget, step), planes, link_x, link_y, budget, weight, step=step)
-
-
-def _explicit_fwd(planes, link_x, link_y, budget, weight, step, slots):
-    fixed = (link_x, link_y, budget, weight)
-    return _forward(0, _count(budget, step), planes, *fixed, step=step), (planes, fixed)
-
-
-def _explicit_bwd(step, slots, saved, cotangent):
-    """Reverse mode without storing every step.
-
-    A is symmetric, so the cotangent is pulled back by the same operator: lam <- lam + A (dt lam). The derivative with
-    respect to a link is -jump(dt lam) jump(g), and to a pixel's budget lam (A g), summed over the steps; they need g at
-    every step, which is recomputed from kept states.
-    """
-    planes, fixed = saved
-    link_x, link_y, budget, weight = fixed
-    zero = (jnp.zeros_like(link_x), jnp.zeros_like(link_y), jnp.zeros_like(budget))
-    lam, sums = _reverse(0, _count(budget, step), planes, (cotangent, zero), fixed, step, slots)
-    return lam, *sums, jnp.zeros_like(weight)
-
-
-def _reverse_step(k, g, carry, fixed, step):
-    link_x, link_y, budget, weight = fixed
-    lam, (d_x, d_y, d_budget) = carry
-    pulled = (_share(budget, k, step) * weight)[None] * lam
-    lam_x, lam_y = _jumps(pulled)
-    g_x, g_y = _jumps(g)
-    short = (budget - k * step > 0) & (budget - k * step <= step)
-
-    def gain():
-        own = jnp.where(short, weight * jnp.sum(lam * divergence(g, link_x, link_y), axis=0), 0)
-        return d_budget + (jnp.sum(own)[None, None] if budget.shape == (1, 1) else own)
-
-    sums = (
-        d_x - jnp.sum(lam_x * g_x, axis=0),
-        d_y - jnp.sum(lam_y * g_y, axis=0),
-        lax.cond(jnp.any(short), gain, lambda: d_budget),
-    )
-    return lam + divergence(pulled, link_x, link_y), sums
-
-
-def _reverse(start, count, g, carry, fixed, step, slots):
-    """Pull `carry` back through `count` steps that begin at `start` with state `g`."""
-    span = math.prod(slots[1:])
-    pieces = (count + span - 1) // span
-
-    def keep(i, kept):
-        states, g = kept
-        states = lax.dynamic_update_index_in_dim(states, g, i, 0)
-        first = start + i * span
-        return states, _forward(first, first + jnp.where(i + 1 < pieces, span, 0), g, *fixed, step=step)
-
-    def back(j, carry):
-        i = pieces - 1 - j
-        first, state = start + i * span, lax.dynamic_index_in_dim(states, i, 0, keepdims=False)
-        if span == 1:
-            return _reverse_step(first, state, carry, fixed, step)
-        return _reverse(first, jnp.minimum(span, count - i * span), state, carry, fixed, step, slots[1:])
-
-    states, _ = lax.fori_loop(0, pieces, keep, (jnp.zeros((slots[0], *g.shape), g.dtype), g))
-    return lax.fori_loop(0, pieces, back, carry)
-
-
-explicit.defvjp(_explicit_fwd, _explicit_bwd)
-
-
-def slots_for(steps: int, most: int = 8) -> tuple[int, ...]:
-    """`slots` of `explicit` for up to `steps` steps, none above `most`."""
-    depth = 1
-    while most**depth < steps:
-        depth += 1
-    return (max(2, math.ceil(steps ** (1 / depth))),) * depth
-
 
 # ------------------------------------------------------------------------------------------- the fast scheme
 #

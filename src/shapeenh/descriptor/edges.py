@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
+from shapeenh.fusion import stored
 from shapeenh.numerics import norm, safe_divide, smoothstep
-from shapeenh.stencils import shift, stored
+from shapeenh.stencils import shift
 
 # A step counts in units of the distance between neighbouring samples on the surface. Shading normals of real meshes are
 # up to 20 degrees off their facets (0.34); 0.6 is a step of 0.6 pixels between two surfaces that face the viewer.

@@ -11,8 +11,9 @@ import numpy as np
 from shapeenh.checks import check_range, check_shape, check_type, float_dtype, is_concrete
 from shapeenh.descriptor import diffusion, gradient
 from shapeenh.descriptor.view import check_gbuffer, describe, mean_curvature
+from shapeenh.fusion import stored, unknown_truth
 from shapeenh.numerics import eigenvalues, safe_divide, safe_sqrt
-from shapeenh.stencils import derivatives, links, stored, unknown_truth
+from shapeenh.stencils import derivatives, links
 from shapeenh.types import Descriptor
 
 GREATEST_BETA = 20.0

@@ -11,8 +11,10 @@ import numpy as np
 
 from shapeenh.checks import check_choice, check_range, check_shape, check_type, float_dtype, is_concrete
 from shapeenh.descriptor import diffusion, edges, gradient
+from shapeenh.fusion import stored, unknown_truth
+from shapeenh.heat import STEP
 from shapeenh.numerics import determinant, eigenvalues, safe_divide, safe_hypot
-from shapeenh.stencils import derivatives, links, stored, unknown_truth
+from shapeenh.stencils import derivatives, links
 from shapeenh.types import Descriptor, GBuffer
 
 CREASE_DEGREES = 40.0
@@ -138,7 +140,7 @@ def _smoothing(sigma, importance, scheme: str) -> tuple[int, bool]:
     known = is_concrete(sigma, importance)
     longest = 0.5 * (float(sigma) if known else diffusion.GREATEST_SIGMA) ** 2
     if importance is not None or scheme == "explicit":
-        steps = longest / diffusion.STEP
+        steps = longest / STEP
         if known and importance is not None:
             most = float(np.max(importance, initial=0))
             steps = min(steps, most) if steps > 0 else most
@@ -197,7 +199,7 @@ def _budget(sigma, importance):
     time = (0.5 * sigma * sigma)[None, None]
     if importance is None:
         return time
-    counted = diffusion.STEP * importance
+    counted = STEP * importance
     return jnp.where(time > 0, jnp.minimum(counted, time), counted)
 
 

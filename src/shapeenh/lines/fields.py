@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 
 from shapeenh.checks import check_choice, check_range, check_shape, check_type, float_dtype
+from shapeenh.heat import explicit
 from shapeenh.numerics import eigenvalues, safe_divide, safe_hypot, safe_sqrt, smoothstep
 from shapeenh.stencils import derivatives, links, shift
 from shapeenh.types import Descriptor, GBuffer, LineField
@@ -22,7 +23,6 @@ KINDS = ("occlusion", "surface", "luminance", "ridge", "valley", "inflection")
 LEAST_HEIGHT = 1e-5  # slopes and curvatures per px below this are rounding, not shape: no direction there
 GREATEST_SIGMA = 20.0
 _STEP_SIGMA = 1.5  # px
-_STEP = 0.2  # of an explicit diffusion step (SPEC 3.5)
 
 # ------------------------------------------------------------------------------------------- public
 
@@ -230,7 +230,8 @@ def _assemble(height, double, good, flat, silhouette, sigma) -> LineField:
     weight = jnp.abs(height)
     planes = jnp.stack([height, weight * double[0], weight * double[1]])
     link_x, link_y = links(lax.stop_gradient(jnp.where(good, 1 - silhouette, 0)))
-    smooth = diffuse(planes, link_x, link_y, 0.5 * sigma * sigma)
+    time = (0.5 * sigma * sigma)[None, None]
+    smooth = explicit(planes, link_x, link_y, time, jnp.ones_like(time))
     # without diffusion the directions are the given ones, also where the height is 0
     double = jnp.where(sigma > 0, smooth[1:], double)
     height = jnp.where(good, smooth[0], 0)
@@ -270,48 +271,3 @@ def _angular(theta, good, flat, silhouette):
         total += w
         cosines += w * jnp.abs(theta[0] * there(theta[0]) + theta[1] * there(theta[1]))
     return jnp.clip(1 - safe_divide(cosines, total), 0, 1)
-
-
-# ------------------------------------------------------------------------------------------- insulated diffusion
-
-
-def _divergence(planes, link_x, link_y):
-    flow_x = jnp.pad(link_x[None] * (planes[:, :, 1:] - planes[:, :, :-1]), ((0, 0), (0, 0), (1, 1)))
-    flow_y = jnp.pad(link_y[None] * (planes[:, 1:] - planes[:, :-1]), ((0, 0), (1, 1), (0, 0)))
-    return flow_x[:, :, 1:] - flow_x[:, :, :-1] + flow_y[:, 1:] - flow_y[:, :-1]
-
-
-def _steps(planes, link_x, link_y, time):
-    def one(k, g):
-        return g + jnp.clip(time - k * _STEP, 0, _STEP) * _divergence(g, link_x, link_y)
-
-    return lax.fori_loop(0, jnp.ceil(time / _STEP - 1e-6).astype(jnp.int32), one, planes)
-
-
-@jax.custom_vjp
-def diffuse(planes, link_x, link_y, time):
-    """`[C, H, W]` planes after explicit steps of dg/ds = div(c grad g) for `time` = sigma^2/2 (SPEC 3.5).
-
-    Links are those of `stencils.links`. Gradient: with respect to planes and time; none with respect to the links.
-    """
-    return _steps(planes, link_x, link_y, time)
-
-
-def _diffuse_fwd(planes, link_x, link_y, time):
-    return _steps(planes, link_x, link_y, time), (planes, link_x, link_y, time)
-
-
-def _diffuse_bwd(saved, cotangent):
-    """The steps are polynomials of one symmetric matrix: the whole is its own adjoint. `time` moves the last step."""
-    planes, link_x, link_y, time = saved
-    whole = jnp.maximum(jnp.ceil(time / _STEP - 1e-6) - 1, 0) * _STEP
-    last = _divergence(_steps(planes, link_x, link_y, whole), link_x, link_y)
-    return (
-        _steps(cotangent, link_x, link_y, time),
-        jnp.zeros_like(link_x),
-        jnp.zeros_like(link_y),
-        jnp.sum(cotangent * last),
-    )
-
-
-diffuse.defvjp(_diffuse_fwd, _diffuse_bwd)
