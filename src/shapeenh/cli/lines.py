@@ -1,98 +1,67 @@
-"""`shapeenh lines`: feature lines of a mesh in a named style."""
+"""`shapeenh lines`: feature lines of an object, or of the frames of a moving picture, in a named style."""
 
 from __future__ import annotations
 
 import argparse
+from functools import lru_cache
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
-from shapeenh import io
-from shapeenh.buffers.gbuffer import render_gbuffer
-from shapeenh.cli import values
-from shapeenh.descriptor.view import describe
+from shapeenh import codecs, io, pipeline
+from shapeenh.cli import frames, render, scene, values
+from shapeenh.cli.terminal import Stopwatch
+from shapeenh.cli.values import UsageError
 from shapeenh.light.radiance import shade
 from shapeenh.lines.brush import composite_lines, draw_lines
-from shapeenh.lines.fields import KINDS, line_field
+from shapeenh.lines.fields import KINDS, line_field, make_line_field
 from shapeenh.lines.noise import surface_noise
 from shapeenh.lines.profile import fit_profile
 from shapeenh.lines.styles import STYLES, style_brush, style_footprint
 from shapeenh.numerics import luminance
-from shapeenh.scene import environment, shapes
-from shapeenh.scene.camera import frame_mesh
-from shapeenh.scene.materials import named_material
+from shapeenh.scene.camera import orthographic_camera
 from shapeenh.style import tone
+from shapeenh.types import GBuffer, replace
 
 PAPER = (0.93, 0.91, 0.86)
 OVER = ("paper", "shading", "transparent")
+OBJECT_KINDS = ("valley", "ridge", "occlusion")
 
 
 def add_parser(commands) -> None:
     """`shapeenh lines` and its options."""
-    add = commands.add_parser("lines", help="feature lines of a mesh in a style", description=run.__doc__)
-    add.set_defaults(run=run)
-    add.add_argument("mesh", nargs="?", metavar="MESH", help="OBJ, PLY, STL, OFF or GLB; default: the carved knot")
-    add.add_argument("-o", "--output", required=True, metavar="OUT", help="picture to write; .png keeps transparency")
-    add.add_argument(
-        "--kinds", type=_kinds, default=("valley", "ridge", "occlusion"), metavar="K,K", help=f"of {', '.join(KINDS)}"
-    )
-    add.add_argument("--style", default="ink", choices=STYLES, help="(default: ink)")
-    add.add_argument("--over", default="paper", choices=OVER, help="what the lines are drawn on (default: paper)")
-    add.add_argument(
-        "--sigma", type=values.number, default=2.0, help="scale of the features, px at 600 px height (default: 2)"
-    )
-    add.add_argument("--size", type=values.size, default=(800, 600), metavar="WxH", help="size (default: 800x600)")
-    add.add_argument("--view", type=values.view, default=(20.0, 15.0), metavar="AZ,EL", help="degrees (default: 20,15)")
-    add.add_argument("--fov", type=values.number, default=30.0, help="vertical field of view, degrees (default: 30)")
+    parser = commands.add_parser("lines", help="feature lines of an object or a video", description=run.__doc__)
+    parser.set_defaults(run=run, background=PAPER)
+    scene.add_arguments(parser)
+    add = parser.add_argument
+    add("more", nargs="*", metavar="FRAMES", help="images, a folder, a pattern, GIF or video: with --kinds luminance")
+    add("-o", "--output", required=True, metavar="OUT", help="picture; of several frames, a folder, .gif or video")
+    add("--kinds", type=_kinds, metavar="K,K", help=f"of {', '.join(KINDS)} (default: {','.join(OBJECT_KINDS)})")
+    add("--style", default="ink", choices=STYLES, help="(default: ink)")
+    add("--over", default="paper", choices=OVER, help="what lines are drawn on; shading: or the frame (default: paper)")
+    add("--color", type=values.color, metavar="NAME|#RRGGBB", help="white, black, grey or a colour, for all lines")
+    add("--sigma", type=values.number, default=2.0, help="scale of the features, px at 600 px height (default: 2)")
+    add("--detail", type=values.number, default=1.0, help="2 shows lines half as strong, 0.5 fewer (default: 1)")
+    add("--fps", type=values.number, help="frames per second of a GIF or video (default: the input's, or 12)")
+    add("--overwrite", action="store_true", help="replace frames that were drawn with other options")
 
 
 def run(arguments) -> None:
-    """Draw occlusions, ridges, valleys and other feature lines of a mesh with implicit brushes."""
+    """Draw feature lines with implicit brushes: those of an object, or the luminance edges of a moving picture.
+
+    A sequence that was interrupted goes on where it stopped when the same command is given again.
+    """
     values.check_between("--sigma", arguments.sigma, 0, 10)
-    values.check_between("--fov", arguments.fov, 0.1, 170)
-    io.check_picture_path(arguments.output)
-    width, height = arguments.size
-    mesh = shapes.carved_knot() if arguments.mesh is None else io.load_mesh(arguments.mesh)
-    azimuth, elevation = np.deg2rad(arguments.view)
-    direction = (
-        float(np.sin(azimuth) * np.cos(elevation)),
-        float(np.sin(elevation)),
-        float(np.cos(azimuth) * np.cos(elevation)),
-    )
-    camera = frame_mesh(mesh, direction=direction, fov_degrees=arguments.fov, aspect=width / height)
-    strokes, gbuffer, picture = lines_of(
-        mesh, camera, kinds=arguments.kinds, style=arguments.style, sigma=arguments.sigma, height=height, width=width
-    )
-    paper = jnp.broadcast_to(jnp.asarray(PAPER), (height, width, 3))
-    if arguments.over == "transparent":
-        alpha = strokes[..., 3:]
-        image = jnp.concatenate([strokes[..., :3] / jnp.maximum(alpha, 1e-6), alpha], axis=-1)
-    elif arguments.over == "shading":
-        image = composite_lines(tone.composite(picture, gbuffer.mask, PAPER), strokes)
-    else:
-        image = composite_lines(paper, strokes)
-    io.save_image(arguments.output, np.asarray(image))
-
-
-def lines_of(mesh, camera, *, kinds, style: str, sigma: float, height: int, width: int):
-    """(strokes [H, W, 4], G-buffer, shaded picture [H, W, 3]); the kinds over one another in the given order."""
-    scale = height / 600
-    gbuffer = render_gbuffer(mesh, camera, height=height, width=width)
-    descriptor = describe(gbuffer, sigma=sigma * scale)
-    lights = environment.rotate_lights(environment.sample_environment(environment.procedural_studio(), 32), camera)
-    radiance = shade(gbuffer, lights, named_material("stone"))
-    picture = tone.tone_map(radiance, exposure=tone.auto_exposure(radiance, gbuffer.mask))
-    noise = surface_noise(gbuffer, camera, size=max(4.0 * scale, 1.0))
-    strokes = jnp.zeros((height, width, 4), picture.dtype)
-    for kind in kinds:
-        image = luminance(picture) if kind == "luminance" else None
-        field = line_field(kind, gbuffer, descriptor, luminance=image, sigma=1.0)
-        brush = style_brush(style, kind, height=height)
-        radius = 3.0 if kind == "occlusion" else 4.0
-        profile = fit_profile(field, radius=radius, least=float(brush.low))
-        layer = draw_lines(profile, field, brush, footprint=style_footprint(style), shading=picture, noise=noise)
-        strokes = layer + (1 - layer[..., 3:]) * strokes
-    return strokes, gbuffer, picture
+    values.check_between("--detail", arguments.detail, 0.01, 100)
+    if arguments.fps is not None:
+        values.check_between("--fps", arguments.fps, 0.1, 240)
+    inputs = [*([arguments.input] if arguments.input else []), *arguments.more]
+    if arguments.kind is None and frames.is_frames(inputs):
+        return _run_frames(arguments, inputs)
+    if len(inputs) > 1:
+        raise UsageError(f"--as {arguments.kind} takes one input, and {len(inputs)} were given")
+    return _run_object(arguments)
 
 
 def _kinds(text: str) -> tuple[str, ...]:
@@ -100,3 +69,148 @@ def _kinds(text: str) -> tuple[str, ...]:
     if not kinds or any(k not in KINDS for k in kinds):
         raise argparse.ArgumentTypeError(f"{text!r} is not a list of {', '.join(KINDS)}")
     return kinds
+
+
+def _brush(arguments, kind: str, height: int):
+    """The style's brush in the colour and with the threshold asked for."""
+    brush = style_brush(arguments.style, kind, height=height)
+    brush = replace(brush, low=brush.low / arguments.detail, high=brush.high / arguments.detail)
+    if arguments.color is None:
+        return brush
+    return replace(brush, color=tuple(float(c) for c in codecs.srgb_decode(np.asarray(arguments.color))), shade=0.0)
+
+
+def _wants(arguments, *fields: str) -> bool:
+    """Whether any brush that may be used has one of these fields, so that what nobody needs is not computed."""
+    brushes = [_brush(arguments, kind, pipeline.REFERENCE_HEIGHT) for kind in KINDS]
+    return any(getattr(brush, field) > 0 for brush in brushes for field in fields)
+
+
+def _over(strokes, below):
+    """Strokes over a picture [H, W, 3], or as a picture with alpha over nothing."""
+    if below is not None:
+        return np.asarray(composite_lines(below, strokes))
+    alpha = strokes[..., 3:]
+    return np.asarray(jnp.concatenate([strokes[..., :3] / jnp.maximum(alpha, 1e-6), alpha], axis=-1))
+
+
+# ------------------------------------------------------------------------------------------- an object
+
+
+def _run_object(arguments) -> None:
+    io.check_picture_path(arguments.output)
+    clock = Stopwatch(repeat=False)
+    loaded = scene.load(arguments, clock)
+    gbuffer = clock.stage("G-buffer", lambda: loaded.gbuffer(1))
+    descriptor = clock.stage("descriptor", lambda: render.described(gbuffer, arguments))
+    kinds = arguments.kinds or OBJECT_KINDS
+    picture, exposure, radiance = None, None, None
+    if arguments.over == "shading" or "luminance" in kinds or _wants(arguments, "shade"):
+        radiance = clock.stage("shade", lambda: shade(gbuffer, loaded.lights, loaded.material))
+        exposure = tone.auto_exposure(radiance, gbuffer.mask)
+        picture = tone.tone_map(radiance, exposure=exposure)
+    camera = image_camera(gbuffer) if loaded.camera is None else loaded.camera
+    strokes = clock.stage("lines", lambda: object_lines(gbuffer, descriptor, picture, camera, arguments, kinds))
+    below = None
+    if arguments.over == "paper":
+        below = jnp.broadcast_to(jnp.asarray(PAPER, strokes.dtype), (*strokes.shape[:2], 3))
+    elif arguments.over == "shading":
+        fine, samples = gbuffer, loaded.samples
+        if samples > 1:
+            fine = loaded.gbuffer(samples)
+            radiance = shade(fine, loaded.lights, loaded.material)
+        below = jnp.asarray(render.side_by_side([radiance], exposure, fine.mask, arguments, samples))
+    clock.once("save", lambda: io.save_image(arguments.output, _over(strokes, below)))
+
+
+def object_lines(gbuffer, descriptor, picture, camera, arguments, kinds):
+    """Strokes [H, W, 4] of several kinds, each with its own brush, over one another in the given order.
+
+    picture: [H, W, 3], for brushes that take their colour from it and for luminance edges; or None.
+    """
+    height, width = gbuffer.mask.shape
+    noise = None
+    if _wants(arguments, "paper", "gaps", "tint", "wobble"):
+        noise = surface_noise(gbuffer, camera, size=max(4.0 * height / pipeline.REFERENCE_HEIGHT, 1.0))
+    strokes = jnp.zeros((height, width, 4), descriptor.hessian.dtype)
+    for kind in kinds:
+        image = luminance(picture) if kind == "luminance" else None
+        field = line_field(kind, gbuffer, descriptor, luminance=image, sigma=1.0)
+        brush = _brush(arguments, kind, height)
+        profile = fit_profile(field, radius=3.0 if kind == "occlusion" else 4.0, least=float(brush.low))
+        footprint = style_footprint(arguments.style)
+        layer = draw_lines(profile, field, brush, footprint=footprint, shading=picture, noise=noise)
+        strokes = layer + (1 - layer[..., 3:]) * strokes
+    return strokes
+
+
+def image_camera(gbuffer):
+    """The orthographic camera of a G-buffer that came from an image: pixels to its world units."""
+    mask, position = np.asarray(gbuffer.mask), np.asarray(gbuffer.position)
+    height, width = mask.shape
+    rows, columns = np.nonzero(mask)
+
+    def pitch(numbers, coordinate):
+        if numbers.size == 0 or numbers.min() == numbers.max():
+            return 1.0
+        first, last = numbers.argmin(), numbers.argmax()
+        step = (coordinate[mask][last] - coordinate[mask][first]) / (numbers[last] - numbers[first])
+        return abs(float(step)) or 1.0
+
+    dx, dy = pitch(columns, position[..., 0]), pitch(rows, position[..., 1])
+    return orthographic_camera((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), height=height * dy, aspect=width * dx / (height * dy))
+
+
+# ------------------------------------------------------------------------------------------- frames
+
+
+def _run_frames(arguments, inputs) -> None:
+    if arguments.kinds != ("luminance",):
+        raise UsageError(f"{inputs[0]} holds pictures without geometry; accepted with --kinds luminance")
+    if arguments.size is not None:
+        raise UsageError("--size is for meshes and points; frames keep their own size")
+    source = frames.open_source(inputs)
+    if source.count == 1 and Path(arguments.output).suffix.lower() in io.PICTURE_SUFFIXES:
+        io.check_picture_path(arguments.output)
+        io.save_image(arguments.output, frame_lines(next(source.frames).read(), arguments))
+        return
+    options = {name: getattr(arguments, name) for name in ("style", "over", "color", "sigma", "detail")}
+    options = {k: list(v) if isinstance(v, tuple) else v for k, v in options.items()} | {"input": source.origin}
+    if arguments.over == "transparent" and Path(arguments.output).suffix.lower() in frames.MOVING_SUFFIXES:
+        raise UsageError("a GIF or video keeps no transparency; accepted for --over transparent is a folder")
+    sink = frames.Sink(arguments.output, options, overwrite=arguments.overwrite)
+    drawn, kept = frames.run(source, sink, lambda picture: frame_lines(picture, arguments), fps=arguments.fps)
+    if kept:
+        print(f"{drawn} frames drawn, {kept} kept from an earlier run")
+
+
+def frame_lines(picture, arguments) -> np.ndarray:
+    """The luminance edges of one frame, drawn (TH10 fig. 8.9); [H, W, 3] or, if transparent, [H, W, 4], linear.
+
+    Edges are those of the displayed picture, which is how an eye sees them; nothing is known of depth, so directions
+    alone make singularities, and noise stays where it is on the paper.
+    """
+    height, width = picture.shape[:2]
+    scale = height / pipeline.REFERENCE_HEIGHT
+    grey = luminance(jnp.asarray(picture))
+    smooth = make_line_field(grey, jnp.zeros((height, width, 2)), sigma=min(arguments.sigma * scale, 20.0)).height
+    field = line_field("luminance", None, None, luminance=smooth, sigma=1.0)
+    brush = _brush(arguments, "luminance", height)
+    profile = fit_profile(field, least=float(brush.low))
+    below = None
+    linear = jnp.asarray(codecs.srgb_decode(picture), jnp.float32)
+    if arguments.over != "transparent":
+        below = linear if arguments.over == "shading" else jnp.broadcast_to(jnp.asarray(PAPER), linear.shape)
+    noise = paper_noise(height, width) if _wants(arguments, "paper", "gaps", "tint", "wobble") else None
+    footprint = style_footprint(arguments.style)
+    return _over(draw_lines(profile, field, brush, footprint=footprint, shading=linear, noise=noise), below)
+
+
+@lru_cache(maxsize=1)
+def paper_noise(height: int, width: int):
+    """Noise for pictures of this size that know no surface: that of a plane in front of the viewer."""
+    empty = jnp.zeros((height, width))
+    vectors = jnp.zeros((height, width, 3))
+    flat = GBuffer(mask=empty > 0, depth=empty, normal=vectors, position=vectors)
+    camera = orthographic_camera((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), height=float(height), aspect=width / height)
+    return surface_noise(flat, camera, size=max(4.0 * height / pipeline.REFERENCE_HEIGHT, 1.0))

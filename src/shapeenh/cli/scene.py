@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
 from shapeenh import io
+from shapeenh.buffers.coverage import sample_coverage
 from shapeenh.buffers.gbuffer import render_gbuffer
 from shapeenh.buffers.points import gbuffer_from_points
 from shapeenh.buffers.sources import gbuffer_from_height, gbuffer_from_normals
@@ -17,7 +19,7 @@ from shapeenh.cli import values
 from shapeenh.cli.values import UsageError
 from shapeenh.scene import environment, shapes
 from shapeenh.scene.camera import frame_mesh
-from shapeenh.types import GBuffer, Lights, Material, Mesh
+from shapeenh.types import Camera, Coverage, GBuffer, Lights, Material, Mesh
 
 KINDS = ("mesh", "points", "height", "normals")
 DEFAULT_SIZE = (800, 600)
@@ -25,14 +27,21 @@ DEFAULT_SIZE = (800, 600)
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """A loaded input: `gbuffer(samples)` makes its G-buffer with that many samples per pixel and axis."""
+    """A loaded input: `gbuffer(samples)` makes its G-buffer with that many samples per pixel and axis.
+
+    Pictures of point clouds are supersampled: `samples` says by how much. Those of meshes are shaded once per pixel, and
+    `coverage` of their G-buffer smooths the outlines; it is None where that is not wanted. `camera` is None for images,
+    which are seen straight on.
+    """
 
     gbuffer: Callable[[int], GBuffer]
     lights: Lights
     material: Material
     size: tuple[int, int]
     samples: int
+    coverage: Callable[[GBuffer], Coverage] | None
     facts: dict
+    camera: Camera | None = None
 
 
 def add_arguments(parser) -> None:
@@ -71,13 +80,14 @@ def load(arguments, clock) -> Scene:
     if kind in ("height", "normals"):
         gbuffer = clock.once(f"load {kind}", lambda: _from_image(arguments, kind))
         height, width = gbuffer.mask.shape
-        return Scene(lambda samples: gbuffer, _lights(arguments, clock), _material(arguments), (width, height), 1, {})
+        return Scene(lambda samples: gbuffer, _lights(arguments, clock), _material(arguments), (width, height), 1, None, {})
 
     width, height = arguments.size or DEFAULT_SIZE
     if max(width, height) * arguments.samples > values.LARGEST_SIDE:
         raise UsageError(
             f"--size times --samples exceeds {values.LARGEST_SIDE}; accepted is a smaller size or --samples 1"
         )
+    samples, coverage = arguments.samples, None
     look = {"direction": _direction(*arguments.view), "fov_degrees": arguments.fov, "aspect": width / height}
     if kind == "points":
         points, normals, colors = clock.once("load points", lambda: io.load_points(arguments.input))
@@ -96,8 +106,11 @@ def load(arguments, clock) -> Scene:
         def draw(samples):
             return render_gbuffer(mesh, camera, height=height * samples, width=width * samples)
 
+        if samples > 1:
+            samples, coverage = 1, partial(sample_coverage, mesh, camera, samples=samples)
+
     lights = environment.rotate_lights(_lights(arguments, clock), camera)
-    return Scene(draw, lights, _material(arguments), (width, height), arguments.samples, facts)
+    return Scene(draw, lights, _material(arguments), (width, height), samples, coverage, facts, camera)
 
 
 def _kind(arguments) -> str:
@@ -145,7 +158,7 @@ def _lights(arguments, clock) -> Lights:
 
 
 def _material(arguments) -> Material:
-    return Material(**{k: jnp.asarray(v, jnp.float32) for k, v in arguments.material.items()})
+    return Material(**{k: v and jnp.asarray(v, jnp.float32) for k, v in arguments.material.items()})
 
 
 def _direction(azimuth: float, elevation: float) -> tuple[float, float, float]:

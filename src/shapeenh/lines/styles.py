@@ -15,7 +15,7 @@ from shapeenh.types import replace
 _HEIGHTS = {
     "occlusion": (0.04, 0.12),
     "surface": (1.2, 4.0),
-    "luminance": (0.02, 0.12),
+    "luminance": (0.008, 0.05),
     "ridge": (0.06, 0.35),
     "valley": (0.03, 0.20),
     "inflection": (0.02, 0.15),
