@@ -1,5 +1,6 @@
 """shapeenh: makes the shape of things visible. A differentiable JAX toolkit; every public name is here."""
 
+from shapeenh.buffers.coverage import resolve_coverage, sample_coverage
 from shapeenh.buffers.estimate import estimate_normals, estimate_radius
 from shapeenh.buffers.gbuffer import render_gbuffer
 from shapeenh.buffers.interpolate import barycentrics, interpolate
@@ -49,6 +50,7 @@ from shapeenh.style.lit_sphere import lit_sphere
 from shapeenh.style.tone import auto_exposure, composite, tone_map
 from shapeenh.types import (
     Camera,
+    Coverage,
     Descriptor,
     GBuffer,
     Lights,
@@ -64,6 +66,7 @@ from shapeenh.types import (
 __all__ = [
     "Brush",
     "Camera",
+    "Coverage",
     "Descriptor",
     "FitResult",
     "GBuffer",
@@ -132,7 +135,9 @@ __all__ = [
     "rasterize",
     "render",
     "render_gbuffer",
+    "resolve_coverage",
     "rotate_lights",
+    "sample_coverage",
     "sample_environment",
     "sample_texture",
     "save_image",

@@ -59,6 +59,20 @@ class Visibility:
 
 @register_dataclass
 @dataclass(frozen=True, eq=False)
+class Coverage:
+    """Whose shading the samples of each pixel borrow, S x S samples per pixel in reading order.
+
+    source: [H, W, S * S] int8: 0 to 8, one of the 3 x 3 pixels around in reading order, 4 being the pixel itself;
+        -1 where the sample sees background. No gradient.
+    fraction: [H, W] in [0, 1], the share of the samples that see a surface; 0 where none does. No gradient.
+    """
+
+    source: jax.Array
+    fraction: jax.Array
+
+
+@register_dataclass
+@dataclass(frozen=True, eq=False)
 class GBuffer:
     """Per-pixel geometry, equal whatever it was made from.
 

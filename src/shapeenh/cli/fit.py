@@ -68,7 +68,8 @@ def run(arguments) -> None:
         gbuffer, picture = _prepare(loaded, arguments, clock, samples)
     plain, warped = picture(None), picture(found.parameters)
     exposure = tone.auto_exposure(plain, gbuffer.mask)
-    shown = render.side_by_side([plain, warped], exposure, gbuffer.mask, arguments, samples)
+    coverage = loaded.coverage and clock.stage("coverage", lambda: loaded.coverage(gbuffer))
+    shown = render.side_by_side([plain, warped], exposure, gbuffer.mask, arguments, samples, coverage=coverage)
     clock.once("save", lambda: io.save_image(arguments.output, shown))
     _report(arguments, found, original)
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shapeenh import io, pipeline
+from shapeenh.buffers.coverage import resolve_coverage
 from shapeenh.cli import scene, values
 from shapeenh.cli.terminal import Stopwatch
 from shapeenh.descriptor.display import curvature_colors
@@ -50,7 +51,9 @@ def run(arguments) -> None:
     warped = clock.stage("shade warped", lambda: pipeline.illuminate(gbuffer, descriptor, lights, material, warp))
 
     exposure = tone.auto_exposure(plain, gbuffer.mask)
-    shown = side_by_side([warped] if arguments.only else [plain, warped], exposure, gbuffer.mask, arguments, samples)
+    coverage = loaded.coverage and clock.stage("coverage", lambda: loaded.coverage(gbuffer))
+    pictures = [warped] if arguments.only else [plain, warped]
+    shown = side_by_side(pictures, exposure, gbuffer.mask, arguments, samples, coverage=coverage)
     clock.once("save", lambda: io.save_image(arguments.output, shown))
     if arguments.buffers is not None:
         if samples > 1:  # the numbers are those of pixel centres, not averages
@@ -78,10 +81,14 @@ def described(gbuffer, arguments):
     return describe(gbuffer, sigma=min(arguments.sigma * scale, 100.0), creases=arguments.crease)
 
 
-def side_by_side(pictures, exposure, mask, arguments, samples: int) -> np.ndarray:
+def side_by_side(pictures, exposure, mask, arguments, samples: int, *, coverage=None) -> np.ndarray:
     """One image for a display. All are exposed alike; samples are averaged after the tone curve, as they are seen."""
     mapped = [tone.tone_map(picture, exposure=exposure) for picture in pictures]
-    panels = [_average(tone.composite(picture, mask, arguments.background), samples) for picture in mapped]
+    if coverage is None:
+        panels = [_average(tone.composite(picture, mask, arguments.background), samples) for picture in mapped]
+    else:
+        behind = (1 - coverage.fraction)[..., None] * jnp.asarray(arguments.background)
+        panels = [np.asarray(resolve_coverage(picture, coverage) + behind) for picture in mapped]
     return np.concatenate(panels, axis=1)
 
 

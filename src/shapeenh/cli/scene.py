@@ -29,9 +29,9 @@ DEFAULT_SIZE = (800, 600)
 class Scene:
     """A loaded input: `gbuffer(samples)` makes its G-buffer with that many samples per pixel and axis.
 
-    Pictures of point clouds are supersampled: `samples` says by how much. Those of meshes are shaded once per pixel, and
-    `coverage` of their G-buffer smooths the outlines; it is None where that is not wanted. `camera` is None for images,
-    which are seen straight on.
+    Pictures of point clouds are supersampled: `samples` says by how much. Those of meshes are shaded once per pixel,
+    and `coverage` of their G-buffer smooths the outlines; it is None where that is not wanted. `camera` is None for
+    images, which are seen straight on.
     """
 
     gbuffer: Callable[[int], GBuffer]
@@ -80,7 +80,8 @@ def load(arguments, clock) -> Scene:
     if kind in ("height", "normals"):
         gbuffer = clock.once(f"load {kind}", lambda: _from_image(arguments, kind))
         height, width = gbuffer.mask.shape
-        return Scene(lambda samples: gbuffer, _lights(arguments, clock), _material(arguments), (width, height), 1, None, {})
+        lights, material = _lights(arguments, clock), _material(arguments)
+        return Scene(lambda samples: gbuffer, lights, material, (width, height), 1, None, {})
 
     width, height = arguments.size or DEFAULT_SIZE
     if max(width, height) * arguments.samples > values.LARGEST_SIDE:

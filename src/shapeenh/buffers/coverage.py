@@ -1,0 +1,360 @@
+"""Smooth outlines at the cost of one shading per pixel: subpixel reconstruction antialiasing.
+
+Chajdas, McGuire and Luebke 2011 (I3D): visibility is cheap, shading is dear, so visibility is sampled S x S times per
+pixel and every sample borrows the shading of the pixel, among the 3 x 3 around it, that shows the same surface. Almost
+all pixels show one surface and keep their own shading; only the others, the *mixed* ones, are listed and looked at.
+
+When are a sample and a pixel on the same surface? When each lies in the other's tangent plane and their normals agree:
+the distance from a plane is measured in pixels' footprints at that depth, the difference of normals as the length of
+their difference. Both count as equal below the first, as different above the second number of PLANE and NORMAL, and
+in between the smaller one wins.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from shapeenh import checks
+from shapeenh.buffers.gbuffer import surface
+from shapeenh.buffers.inputs import check_table
+from shapeenh.buffers.project import clip_matrix
+from shapeenh.buffers.resolve import barycentrics, blend
+from shapeenh.buffers.runs import prefix_count, table_rows
+from shapeenh.buffers.visibility import rasterize
+from shapeenh.buffers.xla import take
+from shapeenh.fusion import stored, unknown_truth
+from shapeenh.types import Camera, Coverage, GBuffer, Mesh
+
+PLANE = (0.5, 2.0)  # pixels' footprints
+NORMAL = (0.25, 1.0)  # lengths of a difference of unit vectors: 14 and 60 degrees
+OWN = 4  # the pixel itself in its 3 x 3 neighbourhood, which is counted in reading order
+ORDER = (4, 1, 3, 5, 7, 0, 2, 6, 8)  # from near to far, so that the nearer of two equally good ones is taken
+NEARER = 1e-3  # weight of a squared distance on screen: decides between pixels of the same surface
+CHUNK = 1024  # mixed pixels per step
+
+# ------------------------------------------------------------------------------------------- from samples to pixels
+
+
+def sample_coverage(
+    mesh: Mesh, camera: Camera, gbuffer: GBuffer, *, samples: int, cull: bool | str = False
+) -> Coverage:
+    """Whose shading each of S x S samples per pixel borrows: own pixel, one of its 8 neighbours, or none.
+
+    Source: Chajdas, McGuire and Luebke 2011 (subpixel reconstruction antialiasing). A sample takes the nearest of the
+    3 x 3 pixels that show its surface; where none does (a wire that no pixel centre meets) the best of those that show
+    anything, its own for choice; where all nine show nothing it counts as background, so that a wire thinner than a
+    pixel is broken, as it is without samples.
+
+    mesh, camera: what `gbuffer` was made from; the size is the G-buffer's.
+    *Static*: samples: per pixel and axis, 1 to 8; 1 tells the mask. cull: as in `rasterize`.
+    Returns a `Coverage` for `resolve_coverage`. The visibility of the samples is computed at S times the resolution,
+    what remains costs by the number of mixed pixels.
+    *Gradient*: none; coverage is a constant of the derivative, as visibility is.
+    *Errors*: ValueError as in `rasterize` and `render_gbuffer`, and where S times the size exceeds 32768.
+
+    >>> coverage = se.sample_coverage(mesh, camera, gbuffer, samples=2)
+    >>> image = se.resolve_coverage(se.tone_map(se.shade(gbuffer, lights, material)), coverage)
+    """
+    checks.check_type("gbuffer", gbuffer, GBuffer)
+    samples = checks.check_size("samples", samples, high=8)
+    height, width = gbuffer.mask.shape
+    if samples == 1:
+        mask = jnp.asarray(gbuffer.mask)
+        return Coverage(source=jnp.where(mask, OWN, -1)[..., None].astype(jnp.int8), fraction=mask.astype(jnp.float32))
+    if max(height, width) * samples > 1 << 15:
+        raise ValueError(f"samples is {samples} for {height} x {width} pixels; accepted are at most 32768 per axis")
+    seen = rasterize(mesh, camera, height=height * samples, width=width * samples, cull=cull)
+    check_table("mesh.normals", mesh.normals, mesh, 3)
+    dtype = checks.float_dtype(mesh.vertices, mesh.normals, camera.view, camera.projection)
+    given = (mesh.vertices, mesh.normals, camera.view, camera.projection, gbuffer.position, gbuffer.normal)
+    arrays = [lax.stop_gradient(jnp.asarray(a, dtype)) for a in given]
+    source, fraction = sources(*arrays, jnp.asarray(mesh.faces, jnp.int32), gbuffer.mask, seen.triangle, samples)
+    return Coverage(source=source, fraction=fraction)
+
+
+@functools.partial(jax.jit, static_argnums=(9,))
+def sources(vertices, normals, view, projection, position, normal, faces, mask, triangle, samples):
+    """The jitted body of `sample_coverage`, of checked arrays."""
+    height, width = mask.shape
+    blocks = triangle.reshape(height, samples, width, samples)
+    some = jnp.max(blocks, axis=(1, 3)) >= 0
+    if faces.shape[0] == 0 or vertices.shape[0] == 0:
+        nothing = jnp.full((height, width, samples * samples), -1, jnp.int8)
+        return nothing, jnp.zeros((height, width), jnp.float32)
+
+    @jax.custom_batching.sequential_vmap
+    def one_view(vertices, normals, view, projection, position, normal, faces, mask, triangle, some, whole):
+        always = unknown_truth(vertices, view, faces, triangle)
+        smooth = whole & mask & ~torn(always, position, normal, mask, pixel_size(projection, height, width))
+        m, _ = clip_matrix(view, projection)
+        tables = vertices, normals, view, projection, m, position, normal, faces, mask, triangle
+        return mixed_pixels(always, tables, some, smooth, samples)
+
+    whole = jnp.min(blocks, axis=(1, 3)) >= 0
+    return one_view(vertices, normals, view, projection, position, normal, faces, mask, triangle, some, whole)
+
+
+def pixel_size(projection, height, width):
+    """Footprint of a pixel per unit of clip w, and the (z, 1) coefficients of w in camera space."""
+    size = 2 / jnp.minimum(height * jnp.abs(projection[1, 1]), width * jnp.abs(projection[0, 0]))
+    return size, projection[3, 2], projection[3, 3]
+
+
+def footprint(z, pixel):
+    """World units per pixel at camera-space z."""
+    size, along, constant = pixel
+    return size * jnp.maximum(along * z + constant, jnp.finfo(z.dtype).tiny)
+
+
+def ramp(x, ends):
+    """0 below, 1 above, linear between."""
+    return jnp.clip((x - ends[0]) * (1 / (ends[1] - ends[0])), 0, 1)
+
+
+def plane_distance(p, q, n):
+    """|n . (p - q)| of three planes each."""
+    return jnp.abs(sum(n[k] * (p[k] - q[k]) for k in range(3)))
+
+
+def normal_distance(n, m):
+    return jnp.sqrt(sum((n[k] - m[k]) ** 2 for k in range(3)))
+
+
+def mismatch(p, n, q, m, size):
+    """0 = the same surface, 1 = another: points p and q with normals n and m, planes of 3 each."""
+    off = jnp.maximum(plane_distance(p, q, n), plane_distance(p, q, m)) / size
+    return jnp.maximum(ramp(off, PLANE), ramp(normal_distance(n, m), NORMAL))
+
+
+# ------------------------------------------------------------------------------------------- which pixels are mixed
+
+
+STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows down, columns right: every pair of neighbours once
+
+
+def torn(always, position, normal, mask, pixel):
+    """[H, W] bool: pixels with a neighbour, out of 8, that shows nothing or another surface."""
+    height, width = mask.shape
+
+    def ends(dy, dx):
+        here = slice(0, height - dy), slice(max(-dx, 0), width - max(dx, 0))
+        there = slice(dy, height), slice(max(dx, 0), width + min(dx, 0))
+        return here, there
+
+    def pad(flags, at):
+        return jnp.pad(flags, [(s.start, size - s.stop) for s, size in zip(at, mask.shape, strict=True)])
+
+    def links(position, normal, mask):
+        """Bit k: the step number k leads from this pixel to another surface."""
+        word = jnp.zeros(mask.shape, jnp.uint8)
+        for k, step in enumerate(STEPS):
+            if step[0] < height and abs(step[1]) < width:
+                here, there = ends(*step)
+                p, q, n, m = ([t[(*at, c)] for c in range(3)] for t in (position, normal) for at in (here, there))
+                off = jnp.maximum(plane_distance(p, q, n), plane_distance(p, q, m))
+                near = off <= PLANE[0] * footprint(jnp.maximum(p[2], q[2]), pixel)
+                alike = sum((n[c] - m[c]) ** 2 for c in range(3)) <= NORMAL[0] ** 2
+                broken = ~(near & alike & mask[here] & mask[there])
+                word = word | pad(jnp.where(broken, jnp.uint8(1 << k), jnp.uint8(0)), here)
+        return word
+
+    word = stored(always, links, position, normal, mask)
+    out = word > 0
+    for k, step in enumerate(STEPS):
+        if step[0] < height and abs(step[1]) < width:
+            here, there = ends(*step)
+            out = out | pad((word[here] & np.uint8(1 << k)) > 0, there)
+    return out
+
+
+def listed(flags, chunk):
+    """Indices of the true flags [n], padded with n, and their number."""
+    n = flags.shape[0]
+    count = prefix_count(flags)
+    room = jnp.full((n + chunk + 1,), n, jnp.int32)
+    at = jnp.where(flags, count - 1, n + chunk)
+    return room.at[at].set(lax.iota(jnp.int32, n), mode="promise_in_bounds").at[n + chunk].set(n), count[-1]
+
+
+# ------------------------------------------------------------------------------------------- and what they see
+
+
+def mixed_pixels(always, tables, some, smooth, samples):
+    """source [H, W, S * S] int8 and fraction [H, W]."""
+    vertices, normals, view, projection, m, position, normal, faces, mask, triangle = tables
+    height, width = mask.shape
+    count = height * width
+    chunk = min(CHUNK, -(-count // 64) * 64)
+    pixels, total = listed((some & ~smooth).reshape(-1), chunk)
+    pixel = pixel_size(projection, height, width)
+    flat_ids, flat_faces = triangle.reshape(-1), faces.reshape(-1)
+    flat_position, flat_normal, flat_mask = position.reshape(-1), normal.reshape(-1), mask.reshape(-1)
+    square = samples * samples
+    sy, sx = np.divmod(np.arange(square, dtype=np.int32)[:, None], np.int32(samples))
+
+    def place(pixel):
+        """Row and column, the samples' ids [S * S, n] and clip x/w, y/w."""
+        pixel = jnp.minimum(pixel, count - 1)
+        row = pixel // width
+        column = pixel - row * width
+        fine_y, fine_x = row[None] * samples + sy, column[None] * samples + sx
+        return row, column, take(flat_ids, fine_y * (width * samples) + fine_x), fine_x, fine_y
+
+    def corners(ids):
+        corner = np.arange(3, dtype=np.int32)[None, :, None]
+        index = take(flat_faces, (jnp.maximum(ids, 0) * 3)[:, None] + corner)
+        return [table_rows((t.reshape(-1), 3), index) for t in (vertices, normals)]
+
+    def values(rows, fine_x, fine_y):
+        """Camera-space position and normal of the samples, [6, S * S, n]."""
+        dtype = vertices.dtype
+        p = (fine_x.astype(dtype) + 0.5) * (2 / (width * samples)) - 1
+        q = 1 - (fine_y.astype(dtype) + 0.5) * (2 / (height * samples))
+        relative = []
+        for axis, t in ((0, p), (1, q)):
+            k = [m[axis, c] - t * m[3, c] for c in range(4)]
+            relative.append(sum(k[c][:, None] * rows[0][:, :, c] for c in range(3)) + k[3][:, None])
+        b, _, inverse, _ = barycentrics(*relative)
+        _, place, n = surface(view, b, [blend(b, t) for t in rows], rows, inverse)[:3]
+        return jnp.stack(place + n)
+
+    def around(row, column):
+        """Position, normal and whether there is anything, of the 3 x 3 pixels: [9, 6, n] and [9, n]."""
+        y = row[None] + np.repeat(np.arange(-1, 2, dtype=np.int32), 3)[:, None]
+        x = column[None] + np.tile(np.arange(-1, 2, dtype=np.int32), 3)[:, None]
+        inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+        at = jnp.clip(y, 0, height - 1) * width + jnp.clip(x, 0, width - 1)
+        three = np.arange(3, dtype=np.int32)[None, :, None]
+        both = [take(t, (at * 3)[:, None] + three) for t in (flat_position, flat_normal)]
+        return jnp.concatenate(both, 1), inside & take(flat_mask, at)
+
+    def choose(value, near, there, ids):
+        """source [S * S, n]: the neighbour of least mismatch."""
+        best = jnp.full(ids.shape, 8.0, value.dtype)
+        source = jnp.full(ids.shape, -1, jnp.int32)
+        offset_y, offset_x = ((s.astype(value.dtype) + 0.5) / samples - 0.5 for s in (sy, sx))
+        for k in ORDER:
+            at = [near[k, c][None] for c in range(6)]
+            size = footprint(jnp.maximum(value[2], at[2]), pixel)
+            off = mismatch(value[:3], value[3:], at[:3], at[3:], size)
+            screen = (k // 3 - 1 - offset_y) ** 2 + (k % 3 - 1 - offset_x) ** 2
+            score = jnp.where(there[k][None], off + NEARER * screen.astype(value.dtype), 9)
+            source = jnp.where(score < best, k, source)
+            best = jnp.minimum(score, best)
+        return jnp.where(ids >= 0, source, -1).astype(jnp.int8)
+
+    def step(state):
+        i, source, fraction = state
+        pixel = lax.dynamic_slice(pixels, (i * chunk,), (chunk,))
+        row, column, ids, fine_x, fine_y = stored(always, place, pixel)
+        rows = stored(always, corners, ids)
+        value = stored(always, values, rows, fine_x, fine_y)
+        near, there = stored(always, around, row, column)
+        chosen = stored(always, choose, value, near, there, ids)
+        share = jnp.sum((chosen >= 0).astype(jnp.float32), axis=0) * (1 / square)
+        at = {"mode": "drop", "unique_indices": False}
+        return i + 1, source.at[pixel].set(chosen.T, **at), fraction.at[pixel].set(share, **at)
+
+    plain = jnp.where(some, jnp.int8(OWN), jnp.int8(-1)).reshape(-1, 1)
+    state = jnp.int32(0), jnp.broadcast_to(plain, (count, square)), some.reshape(-1).astype(jnp.float32)
+    _, source, fraction = lax.while_loop(lambda state: state[0] * chunk < total, step, state)
+    return source.reshape(height, width, square), fraction.reshape(height, width)
+
+
+# ------------------------------------------------------------------------------------------- from pixels to the picture
+
+
+def resolve_coverage(image, coverage: Coverage):
+    """A picture with smooth outlines: the mean over each pixel's samples of the shading that they borrow.
+
+    Source: Chajdas, McGuire and Luebke 2011. The result is premultiplied: `image * fraction` of a single surface; put
+    it over a background as `result + background * (1 - coverage.fraction)`. For display, apply the tone curve *first*:
+    a light thousands of times brighter than its surroundings would win in every pixel that it touches.
+
+    image: [H, W, C], any unit. coverage: of its size, from `sample_coverage`.
+    Returns [H, W, C]; 0 where no sample is covered; a pixel that shows one surface keeps its value to the bit.
+    *Gradient*: with respect to image, the samples being constants.
+    *Errors*: ValueError for wrong shapes.
+    """
+    checks.check_type("coverage", coverage, Coverage)
+    checks.check_shape("coverage.source", coverage.source, (None, None, None))
+    checks.check_shape("image", image, (*coverage.source.shape[:2], None))
+    image = jnp.asarray(image)
+    return resolved(image.astype(checks.float_dtype(image)), coverage.source)
+
+
+@jax.jit
+def resolved(image, source):
+    return weighted(image, source)
+
+
+@jax.custom_vjp
+def weighted(image, source):
+    return jax.custom_batching.sequential_vmap(gather)(image, source)
+
+
+def gather(image, source):
+    """Forward: mixed pixels read their neighbours."""
+    dtype = image.dtype
+
+    def step(at, weights, valid, flat, out):
+        parts = [jnp.where(weights[k][:, None] > 0, weights[k][:, None] * take(flat, at[k]), 0) for k in range(9)]
+        return out.at[jnp.where(valid, at[OWN], flat.shape[0])].set(sum(parts), mode="drop")
+
+    return over_mixed(step, image, source, dtype)
+
+
+def scatter(cotangent, source):
+    """Reverse: the same weights, from the pixel to its neighbours."""
+
+    def step(at, weights, valid, flat, out):
+        here = take(flat, at[OWN])
+        for k in range(9):
+            add = jnp.where(valid[:, None], weights[k][:, None] * here, 0)
+            out = out.at[at[k]].add(add, mode="promise_in_bounds")
+        return out
+
+    return over_mixed(step, cotangent, source, cotangent.dtype)
+
+
+def over_mixed(step, image, source, dtype):
+    """`image` where all samples take their own pixel, and 0 elsewhere; then `step` for the listed mixed pixels."""
+    height, width, square = source.shape
+    count = height * width
+    chunk = min(CHUNK, -(-count // 64) * 64)
+    own = jnp.all(source == OWN, axis=-1)
+    pixels, total = listed((~own & jnp.any(source >= 0, axis=-1)).reshape(-1), chunk)
+    flat, codes = image.reshape(count, -1), source.reshape(count, square)
+    out = jnp.where(own.reshape(-1, 1), flat, 0)
+
+    def body(state):
+        i, out = state
+        pixel = lax.dynamic_slice(pixels, (i * chunk,), (chunk,))
+        valid = pixel < count
+        pixel = jnp.minimum(pixel, count - 1)
+        code = take(codes, pixel)
+        numbers = np.arange(9, dtype=np.int8)
+        weights = jnp.stack([jnp.sum((code == k).astype(dtype), axis=1) for k in numbers]) * (1 / square)
+        row = pixel // width
+        y = row[None] + np.repeat(np.arange(-1, 2, dtype=np.int32), 3)[:, None]
+        x = (pixel - row * width)[None] + np.tile(np.arange(-1, 2, dtype=np.int32), 3)[:, None]
+        at = jnp.clip(y, 0, height - 1) * width + jnp.clip(x, 0, width - 1)  # no weight lies outside of the image
+        return i + 1, step(at, weights, valid, flat, out)
+
+    return lax.while_loop(lambda state: state[0] * chunk < total, body, (jnp.int32(0), out))[1].reshape(image.shape)
+
+
+def _weighted_fwd(image, source):
+    return weighted(image, source), source
+
+
+def _weighted_bwd(source, cotangent):
+    return jax.custom_batching.sequential_vmap(scatter)(cotangent, source), np.zeros(source.shape, jax.dtypes.float0)
+
+
+weighted.defvjp(_weighted_fwd, _weighted_bwd)
