@@ -37,8 +37,8 @@ def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=1.0) -> 
     | occlusion | gradient of depth, with every step of depth counted as 1 | along the gradient |
     | surface | gradient of the relative depth field | along the gradient |
     | luminance | gradient of an image | along the gradient |
-    | ridge | greatest curvature of -H: convex | its principal direction |
-    | valley | greatest curvature of H: concave | its principal direction |
+    | ridge | greatest curvature of -H: convex; falls to 0 on saddles that are more concave | its principal direction |
+    | valley | greatest curvature of H: concave; falls to 0 on saddles that are more convex | its principal direction |
     | inflection | gradient of the mean curvature | along the gradient |
 
     Args:
@@ -152,14 +152,20 @@ def _doubled(x, y):
 
 
 def _curvature(hessian, kind):
-    """k_max of -H (ridges) or H (valleys), and its direction: here convexities have negative curvature."""
+    """k_max of -H (ridges) or H (valleys), and its direction: here convexities have negative curvature.
+
+    On a saddle both exist. As in Ohtake et al. 2004, where a valley needs |k_min| > |k_max|, the stronger one wins: from
+    k_max = |k_min| on the height falls, to 0 at 2/3 |k_min|. Without that, a limb, where foreshortening makes convex
+    curvature huge, is covered with short strong "valleys" across it (12 to 20 % of all on scanned meshes).
+    """
     k1, k2 = eigenvalues(hessian)
     a, b = 0.5 * (hessian[..., 0] - hessian[..., 2]), hessian[..., 1]
     size = jnp.abs(hessian[..., 0]) + jnp.abs(hessian[..., 2])
     umbilic = jnp.maximum(jnp.abs(a), jnp.abs(b)) <= jnp.finfo(a.dtype).eps * size  # every direction is principal there
     r = jnp.where(umbilic, 0, safe_hypot(a, b))
     double = jnp.stack([safe_divide(a, r), safe_divide(b, r)])
-    return (-k2, -double) if kind == "ridge" else (k1, double)
+    height, other, double = (-k2, k1, -double) if kind == "ridge" else (k1, -k2, double)
+    return jnp.where(height > 0, jnp.clip(3 * height - 2 * other, 0, height), height), double
 
 
 def _gradient(descriptor, luminance, good, silhouette, kind):
