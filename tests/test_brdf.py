@@ -63,6 +63,15 @@ def test_equals_the_twin_and_is_dark_behind_the_surface(dtype, rng):
     np.testing.assert_array_equal(np.asarray(got)[behind], 0)
 
 
+def test_without_a_specular_lobe(x64, rng):
+    """A matte material is the diffuse term of R_s = 0, whose own lobe is Schlick's at grazing angles."""
+    n, l, e = (jnp.asarray(a) for a in unit(rng, 3, 1000))
+    black = se.Material(jnp.zeros(3), jnp.zeros(3), jnp.asarray(5.0))
+    grey = se.Material(jnp.full(3, 0.5), jnp.zeros(3), jnp.asarray(5.0))
+    expected = np.asarray(brdf(n, l, e, grey)) - np.asarray(brdf(n, l, e, black))
+    np.testing.assert_allclose(brdf(n, l, e, se.Material(jnp.full(3, 0.5))), expected, rtol=1e-9, atol=1e-14)
+
+
 def test_fields_may_be_numbers_or_maps(x64, rng):
     n, l = jnp.asarray(NORMAL), jnp.asarray([[0.6, 0, 0.8], [0, 0, 1.0]])
     a = brdf(n, l, n, se.Material(0.5, 0.1, 20.0))

@@ -132,13 +132,14 @@ class Material:
     """Isotropic Ashikhmin-Shirley reflectance (SPEC 7).
 
     diffuse: [3], R_d in [0, 1]; multiplied by the G-buffer's albedo where there is one.
-    specular: [3], R_s, the Fresnel reflectance at normal incidence, in [0, 1]; 0 = no specular lobe.
-    shininess: [], the Phong exponent eta >= 0.
+    specular: [3], R_s, the Fresnel reflectance at normal incidence, in [0, 1]. At 0 Schlick's formula still reflects
+        at grazing angles; None = no specular lobe, which nothing is computed for.
+    shininess: [], the Phong exponent eta >= 0 of the specular lobe.
     """
 
     diffuse: jax.Array
-    specular: jax.Array
-    shininess: jax.Array
+    specular: jax.Array | None = None
+    shininess: jax.Array | float = 1.0
 
 
 @register_dataclass

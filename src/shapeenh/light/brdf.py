@@ -57,7 +57,9 @@ def ashikhmin_shirley(normal, light, view, material):
     dtype = checks.float_dtype(normal, light, view)
     shape = np.broadcast_shapes(np.shape(normal), np.shape(light), np.shape(view))
     n, l, e = (jnp.broadcast_to(jnp.asarray(a, dtype), shape) for a in (normal, light, view))
-    diffuse, specular = (jnp.broadcast_to(jnp.asarray(a, dtype), shape) for a in (material.diffuse, material.specular))
+    glossy = material.specular is not None
+    reflectance = (material.diffuse, material.specular if glossy else 0.0)
+    diffuse, specular = (jnp.broadcast_to(jnp.asarray(a, dtype), shape) for a in reflectance)
     shininess = jnp.broadcast_to(jnp.asarray(material.shininess, dtype), shape[:-1])[..., None]
 
     cos_light, cos_view = _dot(n, l), _dot(n, e)
@@ -65,16 +67,17 @@ def ashikhmin_shirley(normal, light, view, material):
     opposite = _dot(l + e, l + e) < np.finfo(dtype).tiny ** 0.5
     lit = (cos_light > 0) & (cos_view > 0) & ~opposite
     cos_light, cos_view = jnp.where(lit, cos_light, 1), jnp.where(lit, cos_view, 1)
-    half = numerics.normalize(jnp.where(lit, l + e, e))
-    half_view = jnp.minimum(_dot(half, e), 1)
-    rho = diffuse * (1 - specular) * diffuse_lobe(cos_light, cos_view) + fresnel(specular, half_view) * specular_lobe(
-        jnp.minimum(_dot(n, half), 1), half_view, cos_light, cos_view, shininess
-    )
+    rho = diffuse * (1 - specular) * diffuse_lobe(cos_light, cos_view)
+    if glossy:
+        half = numerics.normalize(jnp.where(lit, l + e, e))
+        half_view, cos_half = jnp.minimum(_dot(half, e), 1), jnp.minimum(_dot(n, half), 1)
+        rho += fresnel(specular, half_view) * specular_lobe(cos_half, half_view, cos_light, cos_view, shininess)
     return jnp.where(lit, rho, 0)
 
 
 def check_material(material) -> None:
     """Ranges of the fields of `Material`, looked at where concrete."""
     checks.check_range("material.diffuse", material.diffuse, 0, 1)
-    checks.check_range("material.specular", material.specular, 0, 1)
+    if material.specular is not None:
+        checks.check_range("material.specular", material.specular, 0, 1)
     checks.check_range("material.shininess", material.shininess, 0, np.inf)

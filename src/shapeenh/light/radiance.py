@@ -24,7 +24,7 @@ def _prologue(model: Model, inputs, on):
     # A visible surface faces the viewer, but interpolated normals overshoot at the limb. There every reflectance is 0,
     # and a black rim would result; with |n_z| the limb continues the shading of the pixels before it.
     nx, ny, nz = normal[:, 0], normal[:, 1], jnp.abs(normal[:, 2])
-    planes = {"nx": nx, "ny": ny, "nz": nz, "shininess": inputs["shininess"][:, 0]}
+    planes = {"nx": nx, "ny": ny, "nz": nz}
 
     factor = jnp.ones_like(nz)
     if model.warped or model.scaled:
@@ -39,7 +39,7 @@ def _prologue(model: Model, inputs, on):
         det = a * c - b * b
         factor = det * jnp.exp(-inputs["contrast"][:, 0] * jnp.log(det))  # J's factor, and eq. 3
     if model.scaled:
-        strengths = {name: inputs[name][:, 0] for name in ("gamma_diffuse", "gamma_specular")}
+        strengths = {f"gamma_{lobe}": inputs[f"gamma_{lobe}"][:, 0] for lobe in _lobes(model)}
         mean, half = 0.5 * xx + 0.5 * yy, 0.5 * xx - 0.5 * yy
         # Off the mask inputs are 0, and sigma would be 0/0 there.
         planes["invariant"] = jnp.where(inputs["invariant"][:, 0] > 0, inputs["invariant"][:, 0], 0.5)
@@ -59,13 +59,21 @@ def _prologue(model: Model, inputs, on):
             kappa = jnp.where(kappa > 0, concave * kappa, kappa)
             planes |= {f"gain_{name[6:]}": gain(strength * kappa) for name, strength in strengths.items()}
 
-    specular = inputs["specular"]
-    diffuse = inputs["diffuse"] * (1 - specular)
+    diffuse = inputs["diffuse"]
     if "albedo" in inputs:
         diffuse = diffuse * inputs["albedo"]
     facing = brdf.DIFFUSE * (1 - (1 - 0.5 * nz) ** 5) * factor
-    peak = (inputs["shininess"] + 1) / (8 * np.pi) * factor[:, None]
-    return planes, (diffuse * facing[:, None], specular * peak, (1 - specular) * peak)
+    diffuse = diffuse * facing[:, None]
+    if not model.glossy:
+        return planes, (diffuse,)
+    specular, shininess = inputs["specular"], inputs["shininess"]
+    planes["shininess"] = shininess[:, 0]
+    peak = (shininess + 1) / (8 * np.pi) * factor[:, None]
+    return planes, (diffuse * (1 - specular), specular * peak, (1 - specular) * peak)
+
+
+def _lobes(model: Model) -> tuple[str, ...]:
+    return ("diffuse", "specular") if model.glossy else ("diffuse",)
 
 
 def _inverse_tensor(xx, xy, yy, convex, concave):
@@ -81,14 +89,16 @@ def _reach(model: Model) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """Which planes of the weights each input of the prologue moves."""
     tensor = ("ux", "uy", "qxx", "qxy", "qyy") if model.warped else ()
     bend = ("rxx", "rxy", "ryy") if model.anisotropic else ()
-    table = {"normal": ("nx", "ny", "nz", *tensor[:2]), "shininess": ("shininess",)}
+    table = {"normal": ("nx", "ny", "nz", *tensor[:2])}
+    if model.glossy:
+        table["shininess"] = ("shininess",)
     if model.warped:
         table |= {"alpha": (*tensor, *bend)}
     if model.scaled and model.anisotropic:
         table |= {"anisotropy": bend, "concave": (*tensor, *bend, "concave"), "hessian": (*tensor, *bend, "mean")}
-        table |= {name: (name,) for name in ("gamma_diffuse", "gamma_specular")}
+        table |= {name: (name,) for name in (f"gamma_{lobe}" for lobe in _lobes(model))}
     elif model.scaled:
-        gains = ("gain_diffuse", "gain_specular")
+        gains = tuple(f"gain_{lobe}" for lobe in _lobes(model))
         table |= {"concave": (*tensor, *gains), "hessian": (*tensor, *gains)}
         table |= {f"gamma_{name[5:]}": (name,) for name in gains}
     else:
@@ -121,12 +131,13 @@ def _shade(model: Model, gbuffer, lights, material, options: dict):
     if gbuffer.albedo is not None:
         checks.check_shape("gbuffer.albedo", gbuffer.albedo, (*size, 3))
         inputs["albedo"] = jnp.asarray(gbuffer.albedo, dtype)
-    for name, value, channels in (
-        ("diffuse", material.diffuse, 3),
-        ("specular", material.specular, 3),
-        ("shininess", material.shininess, 1),
-    ):
-        inputs[name] = _input(f"material.{name}", value, size, channels, dtype)
+    inputs["diffuse"] = _input("material.diffuse", material.diffuse, size, 3, dtype)
+    if material.specular is None:
+        model = model._replace(glossy=False)
+        options = {name: value for name, value in options.items() if name != "gamma_specular"}
+    else:
+        inputs["specular"] = _input("material.specular", material.specular, size, 3, dtype)
+        inputs["shininess"] = _input("material.shininess", material.shininess, size, 1, dtype)
     for name, value in options.items():
         inputs[name] = jnp.asarray(value, dtype) if name == "hessian" else _input(name, value, size, 1, dtype)
 

@@ -260,8 +260,7 @@ def shade_forward(gbuffer, descriptor, radiance_map, material, *, alpha, gamma=0
     """Light warping in its forward form: `integral rho(e, l) <n.l> L(W(l)) dl`, radiance looked up in a map.
 
     Source: LW09 eq. 1; SPEC 5. The same integral as `shade_warped` with more and more lights; for what can look
-    radiance
-    up in any direction, and slower: a lookup per pixel and direction.
+    radiance up in any direction, and slower: a lookup per pixel and direction.
     gbuffer, descriptor, material, alpha, gamma: as `shade_warped`. radiance_map: [h, w, 3]. rotation: [3, 3], camera
     space to the map's world, or None. *Static*: samples, directions of the quadrature (golden spiral).
     Returns [H, W, 3]; 0 off the mask. Gradient: in all arguments; memory does not grow with samples.
@@ -284,7 +283,8 @@ def shade_forward(gbuffer, descriptor, radiance_map, material, *, alpha, gamma=0
     size = np.shape(gbuffer.normal)
     arrays = (descriptor.hessian, radiance_map, rotation)
     hessian, radiance_map, rotation = (jnp.asarray(a, dtype) for a in arrays)
-    diffuse, specular = (jnp.broadcast_to(jnp.asarray(a, dtype), size) for a in (material.diffuse, material.specular))
-    material = Material(diffuse, specular, jnp.asarray(material.shininess, dtype))
+    material = jax.tree.map(lambda field: jnp.asarray(field, dtype), material)
+    diffuse = jnp.broadcast_to(material.diffuse, size)
+    material = Material(diffuse, material.specular, material.shininess)
     alpha, gamma = (jnp.broadcast_to(jnp.asarray(a, dtype), size[:2]) for a in (alpha, gamma))
     return _integrate(samples, gbuffer, hessian, radiance_map, rotation, material, alpha, gamma)

@@ -37,7 +37,7 @@ class Plan(NamedTuple):
 
     prologue: model, inputs, predicate for `stored` -> (planes of `kernel.planes_of(model)`, each (block, 64), rest),
     rest any pytree of arrays.
-    epilogue: (sums, rest) -> (block, 3, 64); sums are the three components' (block, 3, 64); linear in them.
+    epilogue: (sums, rest) -> (block, 3, 64); sums are the components' (block, 3, 64); linear in them.
     reach: which planes each input moves, so that derivatives nobody asks for are not computed.
     group, chunk: blocks per step and lights per step.
     """
@@ -126,7 +126,7 @@ def _forms(model: kernel.Model, planes, light):
 
 
 def _weights(model: kernel.Model, on, planes, rows):
-    """(log(n.h), (A, B, C)), each (block, light, 64) and stored.
+    """(log(n.h), the weights), each (block, light, 64) and stored.
 
     The logarithm apart: one kernel for it and one for the rest keep fewer values alive than a single one, and take a
     tenth less time.
@@ -140,8 +140,8 @@ def _weights(model: kernel.Model, on, planes, rows):
         light, _ = _unpack(rows)
         return kernel.weights(model, _forms(model, planes, light), light, log)
 
-    log = stored(on, log, planes, rows)
-    return log, stored(on, weigh, planes, rows, log)
+    logarithm = stored(on, log, planes, rows) if model.glossy else None
+    return logarithm, stored(on, weigh, planes, rows, logarithm)
 
 
 def _add_weighted(total, weight, colour):
@@ -229,7 +229,7 @@ def _forward(plan: Plan, mask, inputs, direction, radiance, count):
 
         zero = jnp.zeros((walk.group, 3, blocks.PIXELS), planes.dtype)
         box = tuple(lax.dynamic_slice_in_dim(a, i * walk.group, walk.group, axis=1) for a in (walk.low, walk.high))
-        sums = _light_loop(plan, box, table, count, body, (zero,) * kernel.COMPONENTS)
+        sums = _light_loop(plan, box, table, count, body, (zero,) * plan.model.components)
         return blocks.write(image, ids, stored(on, lambda *a: jnp.where(valid, plan.epilogue(*a), 0), sums, rest))
 
     image = jnp.zeros((*mask.shape, 3), radiance.dtype)
@@ -276,7 +276,7 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
         given = jnp.where(valid & fresh, blocks.read(cotangent, ids), 0)
         planes, rest = stored(on, lambda pixels: _plane_array(plan, on, pixels), pixels)
         zero = jnp.zeros((walk.group, 3, blocks.PIXELS), planes.dtype)
-        sums = (zero,) * kernel.COMPONENTS
+        sums = (zero,) * plan.model.components
         # The epilogue is linear in the sums, so their cotangents do not depend on them.
         pull_sums = jax.vjp(lambda *sums: plan.epilogue(sums, rest), *sums)[1]
         sums_bar = stored(on, lambda given: pull_sums(given), given)
@@ -292,7 +292,7 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
                 light, colour = _unpack(rows)
                 form = _forms(plan.model, planes, light)
                 along = tuple(sum(bar[:, None, c] * colour[:, :, c, None] for c in range(3)) for bar in sums_bar)
-                bar, w_bar = kernel.adjoint(plan.model, form, light, log, weight[:2], along)
+                bar, w_bar = kernel.adjoint(plan.model, form, light, log, weight, along)
                 return {name: bar[name] for name in used}, w_bar
 
             if used:

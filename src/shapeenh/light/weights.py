@@ -31,9 +31,13 @@ class Model(NamedTuple):
     warped: bool = False
     scaled: bool = False
     anisotropic: bool = False
+    glossy: bool = True  # without it there is no specular lobe: A alone, and nothing of B and C is computed
+
+    @property
+    def components(self) -> int:
+        return 3 if self.glossy else 1
 
 
-COMPONENTS = 3
 COEFFICIENTS = ("one", "x", "y", "z", "xx", "xy", "yy", "w")
 
 
@@ -51,7 +55,9 @@ def coefficients(direction):
 def terms(model: Model) -> dict[str, tuple[tuple[str, str], ...]]:
     """The forms: name -> (plane of the pixel, coefficient of the light) pairs."""
     square = ("xx", "xy", "yy")
-    table: dict[str, tuple[tuple[str, str], ...]] = {"cos_view": (("nz", "one"),), "shininess": (("shininess", "one"),)}
+    table: dict[str, tuple[tuple[str, str], ...]] = {"cos_view": (("nz", "one"),)}
+    if model.glossy:
+        table["shininess"] = (("shininess", "one"),)
     if model.warped:
         # With T = L^-1 and p' of the light: T p' . n_xy = (T n_xy) . p' and |T p'|^2 = p' . T^2 p'.
         table["tilt"] = (("ux", "x"), ("uy", "y"))
@@ -61,15 +67,17 @@ def terms(model: Model) -> dict[str, tuple[tuple[str, str], ...]]:
     if model.scaled:
         table["invariant"] = (("invariant", "one"),)
         if model.anisotropic:
-            table["gamma_diffuse"] = (("gamma_diffuse", "one"),)
-            table["gamma_specular"] = (("gamma_specular", "one"),)
+            table |= {name: ((name, "one"),) for name in _by_lobe(model, "gamma")}
             table["concave"] = (("concave", "one"),)
             table["mean"] = (("mean", "one"),)
             table["bend"] = tuple((f"r{s}", s) for s in square)
         else:
-            table["gain_diffuse"] = (("gain_diffuse", "one"),)
-            table["gain_specular"] = (("gain_specular", "one"),)
+            table |= {name: ((name, "one"),) for name in _by_lobe(model, "gain")}
     return table
+
+
+def _by_lobe(model: Model, what: str) -> tuple[str, ...]:
+    return (f"{what}_diffuse", f"{what}_specular")[: 1 + model.glossy]
 
 
 def planes_of(model: Model) -> tuple[str, ...]:
@@ -185,20 +193,22 @@ def meet(model: Model, form: dict, light: dict) -> Meeting:
 
 
 def weights(model: Model, form: dict, light: dict, log=None):
-    """(A, B, C) of the module's docstring; `log` is log(n.h) where it is there already."""
+    """(A, B, C) of the module's docstring, or (A,); `log` is log(n.h) where it is there already."""
     at = meet(model, form, light)
-    log = logarithm(at.cos_half) if log is None else log
-    tiny = np.finfo(log.dtype).tiny ** 0.25
     lit = at.cos_light * at.j
     diffuse = (1 - _fifth(1 - 0.5 * at.cos_light)) * lit
+    if model.scaled:
+        gain_diffuse, gain_specular = _gains(model, form, at.j)
+        diffuse = diffuse * scaling(gain_diffuse, jnp.minimum(at.cos_light, 1), form["invariant"])
+    if not model.glossy:
+        return (diffuse,)
+    log = logarithm(at.cos_half) if log is None else log
+    tiny = np.finfo(log.dtype).tiny ** 0.25
     # The larger cosine is at least n.e; at n.e = 0 an unlit pixel would divide 0 by 0.
     top = jnp.maximum(jnp.maximum(at.cos_light, form["cos_view"]), tiny)
     specular = exponential(jnp.minimum(form["shininess"] * log, 0)) * lit / (at.half_view * top)
     if model.scaled:
-        gain_diffuse, gain_specular = _gains(model, form, at.j)
-        a = form["invariant"]
-        diffuse = diffuse * scaling(gain_diffuse, jnp.minimum(at.cos_light, 1), a)
-        specular = specular * scaling(gain_specular, jnp.minimum(at.cos_half, 1), a)
+        specular = specular * scaling(gain_specular, jnp.minimum(at.cos_half, 1), form["invariant"])
     return diffuse, specular, specular * _fifth(1 - at.half_view)
 
 
@@ -209,10 +219,11 @@ def _kappa(form: dict, j):
 
 
 def _gains(model: Model, form: dict, j):
+    """Of the diffuse and of the specular lobe, None where there is none."""
     if not model.anisotropic:
-        return form["gain_diffuse"], form["gain_specular"]
+        return form["gain_diffuse"], form.get("gain_specular")
     _, kappa = _kappa(form, j)
-    return gain(form["gamma_diffuse"] * kappa), gain(form["gamma_specular"] * kappa)
+    return gain(form["gamma_diffuse"] * kappa), gain(form["gamma_specular"] * kappa) if model.glossy else None
 
 
 # ------------------------------------------------------------------------------------------- their derivatives
@@ -230,7 +241,7 @@ def _scaling_slopes(gain, delta, invariant):
 
 
 def adjoint(model: Model, form: dict, light: dict, log, given, along):
-    """Cotangents of the forms and of w, from those of (A, B, C), `along`; `given` are the weights A and B.
+    """Cotangents of the forms and of w, from those of the weights, `along`; `given` are the weights.
 
     By logarithmic derivatives: B is there already, and with P = (B' + C' (1 - e.h)^5) B, primes marking cotangents,
 
@@ -242,55 +253,67 @@ def adjoint(model: Model, form: dict, light: dict, log, given, along):
     """
     at = meet(model, form, light)
     cos_light, cos_view, w = at.cos_light, form["cos_view"], light["w"]
-    diffuse, specular = given
-    along_diffuse, along_specular, along_fresnel = along
-    tiny = np.finfo(cos_view.dtype).tiny ** 0.25
+    nothing = jnp.zeros_like(cos_view)
+    bar = {}
 
-    rest = 1 - at.half_view
-    peak = (along_specular + along_fresnel * _fifth(rest)) * specular
-    whole = along_diffuse * diffuse
-    bar = {"shininess": peak * log}
-
-    # Slope of A over n.l at fixed j and sigma.
+    # The diffuse lobe: the slope of A over n.l at fixed j and sigma.
+    along_diffuse = along[0]
+    whole = along_diffuse * given[0]
     x = 1 - 0.5 * cos_light
     fourth = _fourth(x)
     slope = (1 - fourth * x + 2.5 * cos_light * fourth) * at.j
-    half_slope = form["shininess"]  # d log B / d log n.h
-    log_j = whole + peak
     if model.scaled:
-        a = form["invariant"]
         gain_diffuse, gain_specular = _gains(model, form, at.j)
-        clamped, clamped_half = jnp.minimum(cos_light, 1), jnp.minimum(at.cos_half, 1)
-        slope = slope * scaling(gain_diffuse, clamped, a)
-        by_gain, by_delta, by_invariant = _scaling_slopes(gain_diffuse, clamped, a)
-        half_by_gain, half_by_delta, half_by_invariant = _scaling_slopes(gain_specular, clamped_half, a)
-        bar["invariant"] = whole * by_invariant + peak * half_by_invariant
-        half_slope = half_slope + half_by_delta * jnp.where(at.cos_half < 1, at.cos_half, 0)
-        gain_bar, half_gain_bar = whole * by_gain, peak * half_by_gain  # of log E
-        if model.anisotropic:
-            plain, kappa = _kappa(form, at.j)
-            bar["gamma_diffuse"], bar["gamma_specular"] = gain_bar * kappa, half_gain_bar * kappa
-            inner = gain_bar * form["gamma_diffuse"] + half_gain_bar * form["gamma_specular"]
-            bar["concave"] = jnp.where(plain > 0, inner * plain, 0)
-            inner = inner * jnp.where(plain > 0, form["concave"], 1) * (1 - plain * plain)
-            bar["mean"], bar["bend"] = inner, inner * at.j
-            log_j = log_j + inner * form["bend"] * at.j
-        else:
-            bar["gain_diffuse"] = gain_bar / gain_diffuse
+        clamped = jnp.minimum(cos_light, 1)
+        slope = slope * scaling(gain_diffuse, clamped, form["invariant"])
+        by_gain, by_delta, by_invariant = _scaling_slopes(gain_diffuse, clamped, form["invariant"])
+        gain_bar, bar["invariant"] = whole * by_gain, whole * by_invariant  # of log E, and of a
+    light_bar = along_diffuse * slope + (whole * by_delta if model.scaled else 0)
+    view_bar = log_half_view = nothing
+    log_j = whole
+
+    # The specular lobe.
+    if model.glossy:
+        tiny = np.finfo(cos_view.dtype).tiny ** 0.25
+        along_specular, along_fresnel = along[1], along[2]
+        rest = 1 - at.half_view
+        peak = (along_specular + along_fresnel * _fifth(rest)) * given[1]
+        bar["shininess"] = peak * log
+        half_slope = form["shininess"]  # d log B / d log n.h
+        if model.scaled:
+            clamped = jnp.minimum(at.cos_half, 1)
+            by_gain, by_delta, by_invariant = _scaling_slopes(gain_specular, clamped, form["invariant"])
+            half_gain_bar, bar["invariant"] = peak * by_gain, bar["invariant"] + peak * by_invariant
+            half_slope = half_slope + by_delta * jnp.where(at.cos_half < 1, at.cos_half, 0)
+        # One quotient serves 1/(n.l + n.e) and 1/n.l.
+        safe = jnp.maximum(cos_light, tiny)
+        both = safe + cos_view
+        quotient = peak / (safe * both)
+        by_half = quotient * safe * half_slope
+        grazing = cos_light < cos_view
+        light_bar = light_bar + by_half + jnp.where(grazing, quotient * both, 0)
+        view_bar = by_half - jnp.where(grazing, peak / jnp.maximum(cos_view, tiny), 0)
+        log_half_view = -(half_slope + 1) * peak - 5 * along_fresnel * given[1] * _fourth(rest) * at.half_view
+        log_j = log_j + peak
+
+    # The gains E, whose curvature may see the light.
+    if model.scaled and model.anisotropic:
+        plain, kappa = _kappa(form, at.j)
+        bar["gamma_diffuse"] = gain_bar * kappa
+        inner = gain_bar * form["gamma_diffuse"]
+        if model.glossy:
+            bar["gamma_specular"] = half_gain_bar * kappa
+            inner = inner + half_gain_bar * form["gamma_specular"]
+        bar["concave"] = jnp.where(plain > 0, inner * plain, 0)
+        inner = inner * jnp.where(plain > 0, form["concave"], 1) * (1 - plain * plain)
+        bar["mean"], bar["bend"] = inner, inner * at.j
+        log_j = log_j + inner * form["bend"] * at.j
+    elif model.scaled:
+        bar["gain_diffuse"] = gain_bar / gain_diffuse
+        if model.glossy:
             bar["gain_specular"] = half_gain_bar / gain_specular
 
-    # One quotient serves 1/(n.l + n.e) and 1/n.l.
-    safe = jnp.maximum(cos_light, tiny)
-    both = safe + cos_view
-    quotient = peak / (safe * both)
-    by_half = quotient * safe * half_slope
-    grazing = cos_light < cos_view
-    light_bar = along_diffuse * slope + by_half + jnp.where(grazing, quotient * both, 0)
-    if model.scaled:
-        light_bar = light_bar + whole * by_delta
-    view_bar = by_half - jnp.where(grazing, peak / jnp.maximum(cos_view, tiny), 0)
-    log_half_view = -(half_slope + 1) * peak - 5 * along_fresnel * specular * _fourth(rest) * at.half_view
-
+    # The geometry.
     if not model.warped:
         bar["cos_light"], bar["cos_view"] = light_bar, view_bar
         return bar, 0.5 * log_half_view / w

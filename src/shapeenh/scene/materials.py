@@ -8,8 +8,9 @@ from shapeenh.checks import check_choice
 from shapeenh.types import Material
 
 #        diffuse R_d                 specular R_s            shininess
+#                                    (None: no lobe)
 PRESETS = {
-    "plaster": ((0.80, 0.79, 0.77), (0.00, 0.00, 0.00), 1.0),
+    "plaster": ((0.80, 0.79, 0.77), None, 1.0),
     "clay": ((0.62, 0.46, 0.38), (0.02, 0.02, 0.02), 12.0),
     "stone": ((0.55, 0.54, 0.52), (0.03, 0.03, 0.03), 20.0),
     "porcelain": ((0.75, 0.76, 0.78), (0.05, 0.05, 0.05), 300.0),
@@ -28,4 +29,4 @@ def named_material(name: str) -> Material:
     """
     check_choice("name", name, tuple(PRESETS))
     diffuse, specular, shininess = PRESETS[name]
-    return Material(jnp.asarray(diffuse), jnp.asarray(specular), jnp.asarray(shininess))
+    return Material(jnp.asarray(diffuse), None if specular is None else jnp.asarray(specular), jnp.asarray(shininess))

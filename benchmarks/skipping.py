@@ -1,0 +1,94 @@
+"""What skipping saves: `python -m benchmarks.skipping`; docs/skipping.md is its table.
+
+Each row compares the general variant, which a caller gets whose values are traced, with the one that is chosen from
+concrete inputs: their times, and how far the pictures differ relative to the brightest pixel. armadillo.obj where
+SHAPEENH_DATA names a folder that has it, else the embedded object; 800 x 600, 54 lights.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import shapeenh as se
+from benchmarks import harness
+
+SIZE = {"height": 600, "width": 800}
+
+
+def pairs() -> dict[str, tuple]:
+    """Name -> (general call, call that skips)."""
+    path = harness.data("armadillo.obj")
+    mesh = se.load_mesh(path) if path else se.carved_knot()
+    camera = se.frame_mesh(mesh, direction=(0.3, 0.2, 1), aspect=4 / 3)
+    g = se.render_gbuffer(mesh, camera, **SIZE)
+    d = se.describe(g, sigma=2.0)
+    stone = se.named_material("stone")
+    lights = se.rotate_lights(se.sample_environment(se.procedural_studio(), 54), camera)
+    behind = lights.direction[:, 2:] < 0
+
+    def shade(gbuffer=g, material=stone, radiance=lights.radiance):
+        return se.shade(gbuffer, se.Lights(lights.direction, radiance), material)
+
+    def warp(alpha):
+        return se.shade_warped(g, d, lights, stone, alpha=alpha)
+
+    def scale(gamma=2.0, anisotropy=0.0):
+        strengths = {"gamma_diffuse": gamma, "gamma_specular": gamma, "anisotropy": anisotropy}
+        return se.shade_scaled(g, d, lights, stone, invariant=0.4, **strengths)
+
+    def describe(sigma=2.0, creases=False):
+        return se.describe(g, sigma=sigma, creases=creases).hessian
+
+    def render(enhancement):
+        return se.render(mesh, camera, lights, stone, enhancement, sigma=2.0, **SIZE)
+
+    normal = jnp.where(g.mask[..., None], g.normal, jnp.asarray([0.0, 0.0, 1.0]))
+    full = se.GBuffer(jnp.ones_like(g.mask), g.depth, normal, g.position)
+    dull = se.Material(stone.diffuse, jnp.zeros(3), stone.shininess)
+    sheen = shade(material=se.Material(jnp.zeros(3), jnp.zeros(3), stone.shininess))  # Schlick's, at R_s = 0
+    some = lights.radiance.at[::2].set(0)
+    general_warp, general_scale, general_bend, general_describe = map(
+        jax.jit, (warp, scale, lambda a: scale(anisotropy=a), describe)
+    )
+    return {
+        "no warp (alpha = 0)": (lambda: general_warp(0.0), lambda: warp(0.0)),
+        "no scaling (gamma = 0)": (lambda: general_scale(0.0), lambda: scale(0.0)),
+        "no anisotropy": (lambda: general_bend(0.0), scale),
+        "no specular lobe": (lambda: shade(material=dull), lambda: shade(material=se.Material(stone.diffuse)) + sheen),
+        "every other light dark": (lambda: shade(radiance=jnp.maximum(some, 1e-30)), lambda: shade(radiance=some)),
+        "lights behind the object": (shade, lambda: shade(radiance=jnp.where(behind, lights.radiance, 0))),
+        "background": (lambda: shade(gbuffer=full), shade),
+        "no diffusion (sigma = 0)": (lambda: general_describe(0.0), lambda: describe(0.0)),
+        "no creases": (lambda: describe(creases=True), describe),
+        "no enhancement, so no descriptor": (lambda: render(se.LightWarp(1e-30)), lambda: render(None)),
+    }
+
+
+OTHER_PICTURES = ("lights behind the object", "background", "no creases")  # what is skipped was visible
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeats", type=int, default=9)
+    repeats = parser.parse_args().repeats
+    rows = []
+    for name, (general, skipping) in pairs().items():
+        pictures = [np.asarray(call(), np.float64) for call in (general, skipping)]
+        times = harness.measure({"general": general, "skipping": skipping}, repeats=repeats)
+        slow, fast = times["general"]["median_ms"], times["skipping"]["median_ms"]
+        same = name not in OTHER_PICTURES
+        difference = float(np.abs(pictures[1] - pictures[0]).max() / np.abs(pictures[0]).max()) if same else None
+        rows.append(
+            {"skipped": name, "general_ms": slow, "skipping_ms": fast, "saved": round(1 - fast / slow, 2)}
+            | {"difference": difference}
+        )
+    print(harness.table(rows))
+    print(harness.write("skipping", rows))
+
+
+if __name__ == "__main__":
+    main()
