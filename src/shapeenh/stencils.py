@@ -48,33 +48,19 @@ def _at(padded, dr: int, dc: int, rim: int):
     return padded[..., top : top + h + 2 * rim, left : left + w + 2 * rim]
 
 
-def _along(planes, link, metric, dr: int, dc: int):
+def _along(planes, link, dr: int, dc: int):
     """The derivative towards (dr, dc), on the image and a rim of one pixel.
 
     Central where both neighbours may be read, (-3, 4, -1)/2 where one side is missing, a plain difference where the
     other side has but one pixel: second order everywhere but in the last case. Partial links blend the three.
-
-    Where samples are not evenly spaced, `metric` (a plane of positions along this direction) makes the one-sided
-    difference second order in that position: f1 - f0 - b (f2 - f1) with b = r^2/(2r + 1), r the ratio of both steps; it
-    is then the ratio of two such derivatives that means something.
     """
     f0, f1, f2, e1, e2 = (_at(planes, k * dr, k * dc, 1) for k in (0, 1, 2, -1, -2))
     ahead1, ahead2, behind1, behind2 = (_at(link, k * dr, k * dc, 1)[None] for k in (0, 1, -1, -2))
-
-    def one_sided(first, second, usable, x0, x1, x2):
-        if metric is None:
-            b = usable / 3
-        else:
-            near, far = jnp.abs(x1 - x0), jnp.abs(x2 - x1)
-            r = jnp.where(far > near, safe_divide(near, far), 1)
-            b = usable * r * r / (2 * r + 1)
-        return (first - b * second) / (1 - b)
-
-    m0, m1, m2, l1, l2 = (None if metric is None else _at(metric, k * dr, k * dc, 1)[None] for k in (0, 1, 2, -1, -2))
-    central = 0.5 * (f1 - e1)
-    ahead = one_sided(f1 - f0, f2 - f1, ahead2, m0, m1, m2)
-    behind = one_sided(f0 - e1, e1 - e2, behind2, m0, l1, l2)
-    return ahead1 * behind1 * central + ahead1 * (1 - behind1) * ahead + behind1 * (1 - ahead1) * behind
+    forward, backward = f1 - f0, f0 - e1
+    ahead = forward + 0.5 * ahead2 * (forward - (f2 - f1))
+    behind = backward + 0.5 * behind2 * (backward - (e1 - e2))
+    both = 0.5 * ahead1 * behind1
+    return both * (forward + backward) + ahead1 * (1 - behind1) * ahead + behind1 * (1 - ahead1) * behind
 
 
 def _known(link, dr: int, dc: int):
@@ -105,25 +91,21 @@ def _across(derivative, known, link, dr: int, dc: int):
     )
 
 
-def derivatives(planes, link_x, link_y, always, *, places=None):
+def derivatives(planes, link_x, link_y, always):
     """(d/dx, d/dy) of `[C, H, W]` planes in 1/px, y up, reading only along open links.
 
     Second order up to the outline; 0 where a pixel has no readable neighbour.
-    places: [2, H, W] or None: where the samples were taken, if not at the pixels (see `_along`); ratios of derivatives
-        are then second order in those places.
     always: a true predicate unknown at compile time, for `stored`.
     """
     m = _MARGIN
 
-    def padded(planes, link_x, link_y, places):
-        even = [(0, 0), (m, m), (m, m)]
+    def padded(planes, link_x, link_y):
         link_x = jnp.pad(link_x, ((m, m), (m, m + 1)))
         link_y = jnp.pad(link_y, ((m, m + 1), (m, m)))
-        return jnp.pad(planes, even), link_x, link_y, None if places is None else jnp.pad(places, even)
+        return jnp.pad(planes, [(0, 0), (m, m), (m, m)]), link_x, link_y
 
-    def along(planes, link_x, link_y, places):
-        in_x, in_y = (None, None) if places is None else places
-        return _along(planes, link_x, in_x, 0, 1), _along(planes, link_y, in_y, 1, 0)
+    def along(planes, link_x, link_y):
+        return _along(planes, link_x, 0, 1), _along(planes, link_y, 1, 0)
 
     def across(d_x, d_y, link_x, link_y):
         return (
@@ -131,6 +113,6 @@ def derivatives(planes, link_x, link_y, always, *, places=None):
             -_across(d_y, _known(link_y, 1, 0), link_x, 0, 1),
         )
 
-    planes, link_x, link_y, places = stored(always, padded, planes, link_x, link_y, places)
-    d_x, d_y = stored(always, along, planes, link_x, link_y, places)
+    planes, link_x, link_y = stored(always, padded, planes, link_x, link_y)
+    d_x, d_y = stored(always, along, planes, link_x, link_y)
     return stored(always, across, d_x, d_y, link_x, link_y)

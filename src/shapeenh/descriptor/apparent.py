@@ -39,11 +39,12 @@ def _describe_object(gbuffer, tensor, view):
     plain = describe(gbuffer)
     normal, good = gradient.normal_planes(gbuffer)
     finite = good & jnp.isfinite(gbuffer.depth) & jnp.all(jnp.isfinite(gbuffer.position), axis=-1)
-    position = jnp.where(finite[None], jnp.moveaxis(gbuffer.position, -1, 0), 0)
+    position = [jnp.where(finite, gbuffer.position[..., i], 0) for i in range(3)]
     size = edges.footprint(position, jnp.where(finite, gbuffer.depth, 1), finite)
 
     # the image axes, turned from z to n by the smallest rotation: x - (x.n)/(1 + n_z) (z + n), seen from the world
-    n = normal / jnp.maximum(jnp.sqrt(jnp.sum(normal * normal, axis=0)), 0.5)[None]
+    length = jnp.maximum(jnp.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]), 0.5)
+    n = [plane / length for plane in normal]
     shrink = 1 / jnp.maximum(1 + n[2], 1e-6)
     n_x, n_y = n[0], n[1]
     axes = (
@@ -84,7 +85,7 @@ def _describe_apparent(gbuffer):
     plain = describe(gbuffer)
     normal, _ = stored(always, gradient.normal_planes, gbuffer)
     link_x, link_y = links(plain.conductance)
-    d_x, d_y = derivatives(normal[:2], link_x, link_y, always)
+    d_x, d_y = derivatives(jnp.stack(normal[:2]), link_x, link_y, always)
     # the third component follows from the length, n . dn = 0; it grows without bound at the outline, and so does q
     n_z = jnp.maximum(normal[2], gradient.LEAST_NZ)
     z_x = -(normal[0] * d_x[0] + normal[1] * d_x[1]) / n_z

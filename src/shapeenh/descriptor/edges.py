@@ -1,7 +1,7 @@
 """Where the depth field is singular: silhouettes, creases, and the conductance between them (SPEC 3.2 to 3.4).
 
 LW09 finds silhouettes with a Sobel filter on depth. That fires on every steep slope, too; here the step that the
-normals already predict is taken off first. Normals and positions are planes `[3, H, W]`.
+normals already predict is taken off first. Normals and positions are triples of planes.
 """
 
 from __future__ import annotations
@@ -72,9 +72,10 @@ def _step(normal, position, size, finite, axis: int):
     of the sample distance that the normals predict, size / m_z. Where each sample lies behind the other's tangent plane
     the two planes meet between them: that is a convex surface or edge, however sharp, and no step at all.
     """
-    (p, q), (n_p, n_q), (size_p, size_q) = _pairs(position, axis), _pairs(normal, axis), _pairs(size, axis)
+    size_p, size_q = _pairs(size, axis)
     usable = jnp.logical_and(*_pairs(finite, axis))
-    d = [q[i] - p[i] for i in range(3)]
+    n_p, n_q = zip(*(_pairs(plane, axis) for plane in normal), strict=True)
+    d = [q - p for p, q in (_pairs(plane, axis) for plane in position)]
     m = [n_p[i] + n_q[i] for i in range(3)]
     above_p = n_p[0] * d[0] + n_p[1] * d[1] + n_p[2] * d[2]
     below_q = n_q[0] * d[0] + n_q[1] * d[1] + n_q[2] * d[2]
@@ -95,9 +96,11 @@ def silhouettes(gbuffer, normal, good, always):
     """
 
     def clean(position, depth):
-        position = jnp.moveaxis(position, -1, 0)
-        finite = good & jnp.isfinite(depth) & jnp.all(jnp.isfinite(position), axis=0)
-        return jnp.where(finite[None], position, 0), jnp.where(finite, depth, 1), finite
+        planes = [position[..., i] for i in range(3)]
+        finite = good & jnp.isfinite(depth)
+        for plane in planes:
+            finite = finite & jnp.isfinite(plane)
+        return [jnp.where(finite, plane, 0) for plane in planes], jnp.where(finite, depth, 1), finite
 
     def steps(normal, position, size, finite):
         return _step(normal, position, size, finite, -1), _step(normal, position, size, finite, -2)
@@ -121,8 +124,9 @@ def creases(normal, good, degrees):
     """w_c, [H, W] in [0, 1]: the largest angle between a normal and its eight neighbours', smoothstepped from 3/4 to
     5/4 of `degrees`; 0 off the mask (LW09 4.4, SPEC 3.3).
     """
-    here = good.astype(normal.dtype)
-    largest = jnp.zeros(good.shape, normal.dtype)
+    here = good.astype(normal[0].dtype)
+    largest = jnp.zeros_like(here)
+    normal = jnp.stack(normal)
     for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
         other = shift(shift(normal, dr, 1), dc, 2)
         both = here * shift(shift(here, dr, 0), dc, 1)

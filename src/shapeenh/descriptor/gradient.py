@@ -12,27 +12,26 @@ GREATEST_FORESHORTENING = 4.0
 
 
 def normal_planes(gbuffer):
-    """(normals as planes [3, H, W], good [H, W] bool).
+    """(normals as three planes [H, W], good [H, W] bool).
 
     Good pixels are those on the mask with a finite normal; all others count as off the mask and hold (0, 0, 1).
     Components beyond ±2 are no normal's and are held there.
     """
-    n = jnp.moveaxis(gbuffer.normal, -1, 0)
-    good = gbuffer.mask & jnp.all(jnp.isfinite(n), axis=0)
-    away = jnp.asarray([0, 0, 1], n.dtype)[:, None, None]
-    return jnp.where(good[None], jnp.clip(n, -2, 2), away), good
+    n = gbuffer.normal
+    good = gbuffer.mask & jnp.isfinite(n[..., 0]) & jnp.isfinite(n[..., 1]) & jnp.isfinite(n[..., 2])
+    return tuple(jnp.where(good, jnp.clip(n[..., i], -2, 2), i // 2) for i in range(3)), good
 
 
 def depth_gradient(normal, foreshortening):
     """g = -(n_x, n_y) / n_z^f as planes `[2, H, W]` (SPEC 3.1).
 
-    normal: [3, H, W] planes; n_z is held above 0.01.
+    normal: three planes [H, W]; n_z is held above 0.01.
     foreshortening: [], f >= 0; 1 = the slope of the surface; None means 1, done without logarithms.
     Gradient: exact where n_z > 0.01; with respect to n_z it is 0 below.
     """
     n_z = jnp.maximum(normal[2], LEAST_NZ)
     power = 1 / n_z if foreshortening is None else jnp.exp(-foreshortening * jnp.log(n_z))
-    return -normal[:2] * power[None]
+    return -jnp.stack(normal[:2]) * power[None]
 
 
 # ------------------------------------------------------------------------------------------- the chart
@@ -54,9 +53,8 @@ def _stretch(g, foreshortening, bend):
     """
     q = jnp.maximum(g[0] * g[0] + g[1] * g[1], 1e-12)
     if foreshortening is None:
-        b = 1.0 if bend is None else bend
-        return q, q, b, 0.5 * b
-    b = jnp.clip(2 * foreshortening - 0.1, 0, 1) * (1.0 if bend is None else bend)
+        return q, q, bend, 0.5 * bend
+    b = jnp.clip(2 * foreshortening - 0.1, 0, 1) * bend
     f = jnp.maximum(foreshortening, 0.05)
     return q, jnp.exp(jnp.log(q) / f), b, 0.5 * b * f
 
@@ -66,7 +64,7 @@ def _power(s, exponent):
 
 
 def to_chart(g, foreshortening, bend):
-    """phi(g), `[2, H, W]`; `bend` None = 1."""
+    """phi(g), `[2, H, W]`; bend: [], b in [0, 1]."""
     _, s, _, exponent = _stretch(g, foreshortening, bend)
     return g / _power(s, exponent)[None]
 

@@ -11,11 +11,12 @@ import numpy as np
 
 from shapeenh.checks import check_choice, check_range, check_shape, check_type, float_dtype, is_concrete
 from shapeenh.descriptor import diffusion, edges, gradient
+from shapeenh.descriptor.box import covering_part, crop, paste
 from shapeenh.fusion import stored, unknown_truth
 from shapeenh.heat import STEP
 from shapeenh.numerics import determinant, eigenvalues, safe_divide, safe_hypot
 from shapeenh.stencils import derivatives, links
-from shapeenh.types import Descriptor, GBuffer
+from shapeenh.types import Descriptor, GBuffer, replace
 
 CREASE_DEGREES = 40.0
 
@@ -98,7 +99,8 @@ def describe(gbuffer, *, sigma=0.0, foreshortening=1.0, importance=None, creases
         counts alone decide.
     creases: False (none computed), True (edges sharper than 40 degrees between pixels), or a threshold in degrees.
     scheme: "explicit" (steps of 1/5) or "fast" (the same sigma on a pyramid, to about 1 %; `importance` needs steps).
-    *Static*: scheme; whether `importance` is given and `creases` asked for. A concrete `sigma` = 0 skips the diffusion.
+    *Static*: scheme; whether `importance` is given and `creases` asked for. A concrete `sigma` = 0 skips the
+        diffusion, a concrete mask what lies around it (in images of 2^17 pixels or more).
     Returns a Descriptor; all its fields are 0 off the mask.
     *Gradient*: with respect to normals, depth (through the silhouettes' flanks), sigma, foreshortening and importance.
     *Errors*: ValueError for fields whose shapes disagree, and for numbers out of range.
@@ -124,28 +126,36 @@ def describe(gbuffer, *, sigma=0.0, foreshortening=1.0, importance=None, creases
     dtype = float_dtype(gbuffer.normal)
     as_float = partial(jnp.asarray, dtype=dtype)
     smooth = importance is not None or not is_concrete(sigma) or bool(np.asarray(sigma) > 0)
+    part = covering_part(gbuffer.mask) if is_concrete(gbuffer.mask) else None
+    corner, size = part if part is not None else (None, None)
     return _describe(
         gbuffer,
+        corner,
         as_float(sigma),
         None if is_concrete(foreshortening) and np.asarray(foreshortening) == 1 else as_float(foreshortening),
         None if importance is None else as_float(importance),
         as_float(degrees),
         smoothing=_smoothing(sigma, importance, scheme) if smooth else None,
         with_creases=with_creases,
+        size=size,
     )
 
 
-def _smoothing(sigma, importance, scheme: str) -> tuple[int, bool]:
-    """`levels` and `sure` of `diffuse_stacks`: all that a sigma decides at compile time."""
+def _smoothing(sigma, importance, scheme: str) -> tuple[int, bool, bool]:
+    """`levels` and `sure` of `diffuse_stacks`, and whether a chart is needed: what a sigma decides at compile time.
+
+    The fold at an outline, which the chart is for, is gone within half a pixel: exp(-8 t), less than 1e-6 at sigma 2.
+    """
     known = is_concrete(sigma, importance)
     longest = 0.5 * (float(sigma) if known else diffusion.GREATEST_SIGMA) ** 2
+    chart = not known or importance is not None or sigma < 2
     if importance is not None or scheme == "explicit":
         steps = longest / STEP
         if known and importance is not None:
             most = float(np.max(importance, initial=0))
             steps = min(steps, most) if steps > 0 else most
-        return -max(1, math.ceil(math.log(max(steps, 1)) / math.log(8) + 1e-6)), True
-    return diffusion.levels_for(float(sigma) if known else diffusion.GREATEST_SIGMA), known
+        return -max(1, math.ceil(math.log(max(steps, 1)) / math.log(8) + 1e-6)), True, chart
+    return diffusion.levels_for(float(sigma) if known else diffusion.GREATEST_SIGMA), known, chart
 
 
 def check_gbuffer(gbuffer) -> None:
@@ -160,8 +170,17 @@ def check_gbuffer(gbuffer) -> None:
         check_shape("gbuffer.occlusion", gbuffer.occlusion, (h, w))
 
 
-@partial(jax.jit, static_argnames=("smoothing", "with_creases"))
-def _describe(gbuffer, sigma, foreshortening, importance, degrees, *, smoothing, with_creases):
+@partial(jax.jit, static_argnames=("smoothing", "with_creases", "size"))
+def _describe(gbuffer, corner, sigma, foreshortening, importance, degrees, *, size, **static):
+    if size is None:
+        return _describe_all(gbuffer, sigma, foreshortening, importance, degrees, **static)
+    shape = gbuffer.mask.shape
+    gbuffer, importance = crop((replace(gbuffer, albedo=None, uv=None), importance), corner, size)
+    part = _describe_all(gbuffer, sigma, foreshortening, importance, degrees, **static)
+    return paste(part, corner, shape)
+
+
+def _describe_all(gbuffer, sigma, foreshortening, importance, degrees, *, smoothing, with_creases):
     always = unknown_truth(gbuffer.normal, gbuffer.position, sigma)
 
     # 1-2: silhouettes and creases
@@ -175,18 +194,18 @@ def _describe(gbuffer, sigma, foreshortening, importance, degrees, *, smoothing,
     g = stored(always, gradient.depth_gradient, normal, foreshortening)
 
     # 4-6: diffusion, of the gradient and of the places where it was measured
-    places, bend = None, None
+    places, bend = None, jnp.ones_like(sigma)
     if smoothing is not None:
         budget = _budget(sigma, importance)
         stacks = (g, _coordinates(g))  # of two planes: four at once overflow the cache
-        levels, sure = smoothing
+        levels, sure, chart = smoothing
         g, places = diffusion.diffuse_stacks(stacks, link_x, link_y, budget, c > 0, always, levels=levels, sure=sure)
-        bend = jnp.exp(-8 * jnp.max(budget))  # the fold at the outline is gone within half a pixel
+        bend = jnp.exp(-8 * jnp.max(budget)) if chart else None  # type: ignore[assignment]
 
     # 7: the Hessian, flat at the singular places
-    hessian = _hessian(g, places, link_x, link_y, foreshortening, bend, always)
+    hessian = _hessian(g, places, link_x, link_y, c, foreshortening, bend, always)
     return Descriptor(
-        hessian=jnp.moveaxis(hessian * c[None], 0, -1),
+        hessian=jnp.stack(hessian, axis=-1),
         gradient=jnp.moveaxis(g, 0, -1),
         silhouette=w_s,
         crease=w_c,
@@ -220,28 +239,34 @@ def _coordinates(g):
 _FLOOR = 0.004**2  # |grad X_s|^2 below which X_s counts as constant: a region much narrower than sigma is seen as flat
 
 
-def _hessian(g, places, link_x, link_y, foreshortening, bend, always):
-    """H = grad g_s (grad X_s)^-1, symmetrised, as planes xx, xy, yy (SPEC 3.7)."""
-    planes = gradient.to_chart(g, foreshortening, bend)
-    if places is not None:
-        planes = jnp.concatenate([planes, places])
-    planes = stored(always, lambda p: p, planes)
-    d_x, d_y = derivatives(planes, link_x, link_y, always, places=places)
+def _hessian(g, places, link_x, link_y, c, foreshortening, bend, always):
+    """c H, H = grad g_s (grad X_s)^-1, symmetrised, as planes xx, xy, yy (SPEC 3.7); `bend` None: without the chart."""
 
-    def assemble(g, d_x, d_y):
+    def slopes(g, d_x, d_y):
+        """The derivative of g from that in the chart."""
+        if bend is None:
+            return d_x, d_y
         scale, along = gradient.from_chart(g, foreshortening, bend)
-        s_x, s_y = along * (g[0] * d_x[0] + g[1] * d_x[1]), along * (g[0] * d_y[0] + g[1] * d_y[1])
-        u_x, v_x = scale * (d_x[0] + s_x * g[0]), scale * (d_x[1] + s_x * g[1])
-        u_y, v_y = scale * (d_y[0] + s_y * g[0]), scale * (d_y[1] + s_y * g[1])
-        if d_x.shape[0] == 2:
-            return jnp.stack([u_x, 0.5 * (v_x + u_y), v_y])
-        # H = J^T (J J^T + e^2)^-1 (g_x; g_y), least squares with a floor, J = (x_x y_x; x_y y_y)
-        x_x, y_x, x_y, y_y = d_x[2], d_x[3], d_y[2], d_y[3]
-        a, b, d = x_x * x_x + y_x * y_x + _FLOOR, x_x * x_y + y_x * y_y, x_y * x_y + y_y * y_y + _FLOOR
-        unit = (1 + _FLOOR) / (a * d - b * b)  # so that nothing changes where J = I
-        m_xx, m_xy = unit * (x_x * d - x_y * b), unit * (x_y * a - x_x * b)
-        m_yx, m_yy = unit * (y_x * d - y_y * b), unit * (y_y * a - y_x * b)
-        xy = (m_xx * v_x + m_xy * v_y) + (m_yx * u_x + m_yy * u_y)
-        return jnp.stack([m_xx * u_x + m_xy * u_y, 0.5 * xy, m_yx * v_x + m_yy * v_y])
+        turn = lambda d: scale[None] * (d + (along * (g[0] * d[0] + g[1] * d[1]))[None] * g)  # noqa: E731
+        return turn(d_x), turn(d_y)
 
-    return assemble(g, d_x, d_y)
+    def plain(g, d_x, d_y, c):
+        (u_x, v_x), (u_y, v_y) = slopes(g, d_x, d_y)
+        return c * u_x, c * (0.5 * (v_x + u_y)), c * v_y
+
+    def displaced(g, d_x, d_y, x, y, c):
+        """H = J^T (J J^T + e^2)^-1 (g_x; g_y), least squares with a floor, J = (x_x y_x; x_y y_y)."""
+        (u_x, v_x), (u_y, v_y) = slopes(g, d_x, d_y)
+        (x_x, y_x), (x_y, y_y) = x, y
+        a, b, d = x_x * x_x + y_x * y_x + _FLOOR, x_x * x_y + y_x * y_y, x_y * x_y + y_y * y_y + _FLOOR
+        unit = c * (1 + _FLOOR) / (a * d - b * b)  # so that nothing changes where J = I
+        m_xx, m_xy = x_x * d - x_y * b, x_y * a - x_x * b
+        m_yx, m_yy = y_x * d - y_y * b, y_y * a - y_x * b
+        xy = (m_xx * v_x + m_xy * v_y) + (m_yx * u_x + m_yy * u_y)
+        return unit * (m_xx * u_x + m_xy * u_y), (0.5 * unit) * xy, unit * (m_yx * v_x + m_yy * v_y)
+
+    planes = g if bend is None else stored(always, lambda g: gradient.to_chart(g, foreshortening, bend), g)
+    d_x, d_y = derivatives(planes, link_x, link_y, always)
+    if places is None:
+        return stored(always, plain, g, d_x, d_y, c)
+    return stored(always, displaced, g, d_x, d_y, *derivatives(places, link_x, link_y, always), c)
