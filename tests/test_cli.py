@@ -42,6 +42,23 @@ def test_alpha_zero_shows_the_original_twice(mesh_file, tmp_path):
     assert np.abs(image[:, :48] - image[:, 48:]).max() <= 1
 
 
+def test_samples_smooth_the_outlines_and_leave_the_rest(mesh_file, tmp_path):
+    pictures = {}
+    for samples in ("1", "4"):
+        out = tmp_path / f"{samples}.png"
+        common = ["render", str(mesh_file), "-o", str(out), "--only", "--background", "#ff00ff", "--samples", samples]
+        assert main([*common, *SMALL]) == 0
+        pictures[samples] = se.load_image(out).astype(int)
+    background = lambda image: (image == [255, 0, 255]).all(axis=-1)  # noqa: E731
+    plain, smooth = pictures["1"], pictures["4"]
+    changed = (plain != smooth).any(axis=-1)
+    assert 0.03 < changed.mean() < 0.2
+    assert (background(plain) & ~background(smooth)).sum() > 20  # less than half covered
+    shown = ~background(plain)
+    whole = shown[1:-1, 1:-1] & shown[:-2, 1:-1] & shown[2:, 1:-1] & shown[1:-1, :-2] & shown[1:-1, 2:]
+    assert changed[1:-1, 1:-1][whole].mean() < 0.1
+
+
 def test_only_buffers_and_json(mesh_file, tmp_path, capsys):
     buffers = tmp_path / "buffers"
     buffers.mkdir()

@@ -1,6 +1,7 @@
 """shapeenh: makes the shape of things visible. A differentiable JAX toolkit; every public name is here."""
 
-from shapeenh.buffers.coverage import resolve_coverage, sample_coverage
+from shapeenh.buffers.borrow import resolve_coverage
+from shapeenh.buffers.coverage import sample_coverage
 from shapeenh.buffers.estimate import estimate_normals, estimate_radius
 from shapeenh.buffers.gbuffer import render_gbuffer
 from shapeenh.buffers.interpolate import barycentrics, interpolate

@@ -9,7 +9,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from shapeenh.buffers.coverage import resolve_coverage, sample_coverage
+from shapeenh.buffers.borrow import resolve_coverage
+from shapeenh.buffers.coverage import sample_coverage
 from shapeenh.buffers.gbuffer import render_gbuffer
 from shapeenh.checks import check_range, check_size, check_type
 from shapeenh.descriptor.view import describe

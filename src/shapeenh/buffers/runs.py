@@ -26,6 +26,15 @@ def prefix_count(flags):
     return (within.astype(jnp.int32) + (jnp.cumsum(whole) - whole)[:, None]).reshape(-1)[:n]
 
 
+def listed(flags, chunk):
+    """Indices of the true flags [n], padded with n, and their number."""
+    n = flags.shape[0]
+    count = prefix_count(flags)
+    room = jnp.full((n + chunk + 1,), n, jnp.int32)
+    at = jnp.where(flags, count - 1, n + chunk)
+    return room.at[at].set(lax.iota(jnp.int32, n), mode="promise_in_bounds").at[n + chunk].set(n), count[-1]
+
+
 def covered_runs(flat, group):
     """The runs of flat [n] (int32, -1 = background) with a covered pixel, padded by repeating one, and their number."""
     whole = flat.size // LANES

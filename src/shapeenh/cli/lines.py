@@ -119,7 +119,9 @@ def _run_object(arguments) -> None:
         if samples > 1:
             fine = loaded.gbuffer(samples)
             radiance = shade(fine, loaded.lights, loaded.material)
-        below = jnp.asarray(render.side_by_side([radiance], exposure, fine.mask, arguments, samples))
+        coverage = loaded.coverage and clock.stage("coverage", lambda: loaded.coverage(gbuffer))
+        shown = render.side_by_side([radiance], exposure, fine.mask, arguments, samples, coverage=coverage)
+        below = jnp.asarray(shown)
     clock.once("save", lambda: io.save_image(arguments.output, _over(strokes, below)))
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shapeenh import io, pipeline
-from shapeenh.buffers.coverage import resolve_coverage
+from shapeenh.buffers.borrow import resolve_coverage
 from shapeenh.cli import scene, values
 from shapeenh.cli.terminal import Stopwatch
 from shapeenh.descriptor.display import curvature_colors
@@ -87,7 +87,7 @@ def side_by_side(pictures, exposure, mask, arguments, samples: int, *, coverage=
     if coverage is None:
         panels = [_average(tone.composite(picture, mask, arguments.background), samples) for picture in mapped]
     else:
-        behind = (1 - coverage.fraction)[..., None] * jnp.asarray(arguments.background)
+        behind = (1 - coverage.fraction)[..., None] * jnp.asarray(arguments.background)[None, None]
         panels = [np.asarray(resolve_coverage(picture, coverage) + behind) for picture in mapped]
     return np.concatenate(panels, axis=1)
 
