@@ -1,4 +1,5 @@
-"""What every benchmark shares: interleaved timing with compile apart, a table, JSON with the machine, a data folder."""
+"""What every benchmark shares: interleaved timing with compile apart, a table, JSON with the machine, a plot, a data
+folder."""
 
 from __future__ import annotations
 
@@ -86,6 +87,33 @@ def write(name: str, rows: list[dict], **more) -> Path:
     RESULTS.mkdir(exist_ok=True)
     path = RESULTS / f"{name}.json"
     path.write_text(json.dumps({"machine": machine(), **more, "rows": rows}, indent=1) + "\n")
+    return path
+
+
+def pareto(name: str, series: dict[str, list[tuple]], *, default: str, title: str, error: str) -> Path | None:
+    """`results/NAME.png`: milliseconds against error, one line per series of (label, ms, error), the default ringed.
+
+    None, and a word, where matplotlib (the extra `bench`) is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        print("no plot: matplotlib is missing (pip install shapeenh[bench])")
+        return None
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.add_subplot(xscale="log", yscale="log", xlabel="milliseconds", ylabel=error, title=title)
+    for label, points in series.items():
+        axes.plot([p[1] for p in points], [p[2] for p in points], "o-", label=label, markersize=4)
+        for text, ms, value in points:
+            axes.annotate(text, (ms, value), textcoords="offset points", xytext=(4, 4), fontsize=7)
+            if text == default or f"{label} {text}" == default:
+                axes.plot(ms, value, "o", markersize=13, markerfacecolor="none", markeredgecolor="black")
+    axes.grid(alpha=0.3, which="both")
+    if len(series) > 1:
+        axes.legend(fontsize=8)
+    RESULTS.mkdir(exist_ok=True)
+    path = RESULTS / f"{name}.png"
+    figure.savefig(path, dpi=100)
     return path
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 import shapeenh as se
 from benchmarks import harness
+from benchmarks import light as sums
 
 COUNTS = (16, 32, 54, 128, 256, 512, 1024)
 METHODS = ("uniform", "importance", "median_cut")
@@ -67,11 +68,32 @@ def main() -> None:
                 found = {f"N={n}": round(float(np.mean(errors[look, method, n])), 4) for n in COUNTS}
                 rows.append({"map": name, "look": look, "method": method, **found})
     print(harness.table(rows))
-    mean = {m: [round(float(np.exp(np.mean([np.log(r[f"N={n}"]) for r in rows if r["method"] == m]))), 4) for n in
-    COUNTS]
-            for m in METHODS}  # fmt: skip
-    print("geometric mean over all:", mean)
-    print(harness.write("sampling", rows, reference=REFERENCE, mean=mean))
+    means = {}
+    for method in METHODS:
+        of = [r for r in rows if r["method"] == method]
+        means[method] = {n: round(float(np.exp(np.mean([np.log(r[f"N={n}"]) for r in of]))), 4) for n in COUNTS}
+    print("geometric mean over all:", means)
+    said = conclude(means)
+    print(harness.write("sampling", rows, reference=REFERENCE, mean=means, answer=said))
+    print(said)
+
+
+def conclude(means) -> str:
+    """The plot, and the sentence."""
+    scene, material = sums.ball(sums.COVERED), sums.material()
+    ms = {}
+    for method in METHODS:
+        lights = {n: se.sample_environment(se.procedural_studio(), n, method=method) for n in COUNTS}
+        shade = {n: lambda l=l: se.shade_warped(*scene, l, material, alpha=30.0) for n, l in lights.items()}
+        ms[method] = {n: times["median_ms"] for n, times in harness.measure(shade, repeats=5).items()}
+    series = {m: [(str(n), ms[m][n], means[m][n]) for n in COUNTS] for m in METHODS}
+    harness.pareto("sampling", series, default="median_cut 54", title="Lights", error="relative rms error")
+    default, fewer = means["median_cut"][54], means["median_cut"][16]
+    return (
+        f"Default: median cut, 54 lights, error {default:.3f}; importance {means['importance'][54]:.3f}, uniform "
+        f"{means['uniform'][54]:.3f}. With 16 lights shading takes {ms['median_cut'][16] / ms['median_cut'][54]:.2f} "
+        f"of the time and the error is {fewer:.3f}."
+    )
 
 
 if __name__ == "__main__":

@@ -33,6 +33,13 @@ def x64():
         yield np.dtype(np.float64)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def forget_programs():
+    """Compiled programs of one file are of little use to the next, and a run of all would hold gigabytes of them."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def rng():
     return np.random.default_rng(20090803)
