@@ -173,3 +173,14 @@ def smoothstep(low, high, x):
 def luminance(rgb):
     """Rec. 709 luminance of linear RGB `[..., 3]`."""
     return 0.2126 * rgb[..., 0] + 0.7152 * rgb[..., 1] + 0.0722 * rgb[..., 2]
+
+
+# ------------------------------------------------------------------------------------------- directions
+
+
+def sphere_directions(count: int) -> np.ndarray:
+    """[count, 3] directions that share the sphere equally: the golden spiral."""
+    k = np.arange(count) + 0.5
+    z, phi = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)

@@ -11,15 +11,8 @@ from jax import lax
 
 from shapeenh import checks
 from shapeenh.light.warp import warp_jacobian, warp_tensor
+from shapeenh.numerics import sphere_directions
 from shapeenh.types import Camera, Descriptor, GBuffer
-
-
-def _spiral(count: int):
-    """`count` directions that share the sphere equally: the golden spiral."""
-    k = np.arange(count) + 0.5
-    z, phi = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
 
 
 def _depth_at(depth, mask, projection, point):
@@ -68,7 +61,9 @@ def _occlusion(directions, steps, warped, mask, depth, normal, position, hessian
         return (open_ + jnp.where(visible(l), weight, 0), whole + weight), None
 
     zero = jnp.zeros(depth.shape, normal.dtype)
-    (open_, whole), _ = lax.scan(jax.checkpoint(add), (zero, zero), jnp.asarray(_spiral(2 * directions), normal.dtype))
+    (open_, whole), _ = lax.scan(
+        jax.checkpoint(add), (zero, zero), jnp.asarray(sphere_directions(2 * directions), normal.dtype)
+    )
     # Plain: the share of the hemisphere that is open. Warped: SPEC's integral as it stands, which also brightens and
     # darkens by how much the warp widens the hemisphere.
     amount = open_ * (2 / directions) if warped else open_ / jnp.maximum(whole, 1e-6)

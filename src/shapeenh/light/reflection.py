@@ -55,7 +55,11 @@ def _shade_lookup(look, warped, scaled, gbuffer, hessian, radiance_map, rotation
     radiance = find(radiance_map, _to_map(bent, rotation))
     if scaled:
         # The level is the brightness relative to the map's brightest place, so that hue stays.
-        whole = harmonic_radiance(radiance_map, jnp.asarray(_spiral(512), normal.dtype)) if harmonic else radiance_map
+        whole = (
+            harmonic_radiance(radiance_map, jnp.asarray(numerics.sphere_directions(512), normal.dtype))
+            if harmonic
+            else radiance_map
+        )
         level = numerics.luminance(radiance) / jnp.maximum(jnp.max(numerics.luminance(whole)), 1e-30)
         kappa = curvature_mapping(hessian, direction, options["anisotropy"])
         kappa = jnp.where(kappa > 0, options["concave"] * kappa, kappa)
@@ -224,14 +228,6 @@ def shade_diffuse(
 # ------------------------------------------------------------------------------------------- eq. 1 by quadrature
 
 
-def _spiral(count: int):
-    """`count` directions that share the sphere equally: the golden spiral."""
-    k = np.arange(count) + 0.5
-    z, phi = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
-
-
 @functools.partial(jax.jit, static_argnames=("samples",))
 def _integrate(samples, gbuffer, hessian, radiance_map, rotation, material, alpha, gamma):
     normal, valid = _shading_normal(gbuffer)
@@ -250,7 +246,7 @@ def _integrate(samples, gbuffer, hessian, radiance_map, rotation, material, alph
         light = environment_radiance(radiance_map, _to_map(bent, rotation))
         return total + ashikhmin_shirley(normal, l, view, material) * light * weight, None
 
-    directions = jnp.asarray(_spiral(samples), normal.dtype)
+    directions = jnp.asarray(numerics.sphere_directions(samples), normal.dtype)
     total, _ = lax.scan(add, jnp.zeros_like(normal), directions)
     contrast = jnp.exp(gamma * jnp.log(numerics.determinant(tensor)))[..., None]
     return jnp.where(valid[..., None], total * contrast * (4 * np.pi / samples), 0)
