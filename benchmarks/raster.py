@@ -1,16 +1,35 @@
-"""Visibility, barycentrics, G-buffer, and forward + backward, beside the peers that are installed.
+"""Visibility, barycentrics, G-buffer, gradients and multisampling, beside the peers that are installed.
 
-    python -m benchmarks.raster [MESH ...] [--sizes 800x600 1920x1080] [--subdivide 0 1 2] [--repeats 9]
+    python -m benchmarks.raster [MESH ...] [--sizes 800x600 ...] [--subdivide 0 1 ...] [--zoom 1 3] [--cores 2 1]
+                                [--prototype FOLDER] [--all]
 
-Without MESH: the embedded default object, and bunny.obj and armadillo.obj where SHAPEENH_DATA names a folder that has
-them. All calls of a scene are timed in turns, compile apart. Peers: Open3D (`pip install open3d`) and Mitsuba 3
-(`pip install mitsuba`) answer which face each pixel sees from a BVH that is built beforehand and not timed. Memory: of
-the compiled visibility program, temporaries and output, as XLA states them; `ids_compile_s` is its compile time.
+Without MESH: the embedded object, or bunny.obj (with --all armadillo.obj too) where SHAPEENH_DATA names a folder that
+has them. `--all` takes subdivisions up to 6 million triangles and sizes up to 3840x2160, and half an hour or more.
+
+All calls of a scene are timed in turns, so that a slow phase of the machine hits all alike; `first_ms` is compiling and
+running. One process per number of cores: the second finds what the first compiled in a temporary cache, so its
+`first_ms` says little. `zoom` looks closer, until the frame is covered. Memory is that of the compiled visibility
+program, as XLA states it; `peak_MiB` is what the process has held at most so far, of which about 300 is JAX.
+
+Rows of ours: `ids` (rasterize); `barycentrics + depth` (of given ids); `G-buffer` (ids, depth, position and normal in
+camera space); `forward + backward` (the G-buffer, a loss, and its gradient with respect to vertices, normals and
+camera); `G-buffer samples=2` (and whose shading 2 x 2 samples borrow).
+
+Peers: llvmpipe (`pip install moderngl`, and a Mesa with EGL), Mitsuba 3 (`mitsuba`, and an LLVM library), Open3D
+(`open3d`, and libusb-1.0), DEODR (`deodr`). The ray casters are given their BVH. jaxrenderer 0.3.2 is not here: it
+wants jax < 0.5 and NumPy 1, and cannot be installed beside this package. `--prototype FOLDER` adds a `rasterizer.py`
+and a `resolve.py` with `raster_ids` and `gbuffer`.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -20,110 +39,234 @@ import numpy as np
 import trimesh
 
 import shapeenh as se
-from benchmarks.harness import data, measure, table, write
+from benchmarks.harness import RESULTS, data, measure, table, write
+from benchmarks.peers import raster as peers
 from shapeenh.buffers.visibility import visible_triangles
+from shapeenh.types import replace
+
+LARGEST = 7_000_000  # triangles
+OURS = "shapeenh"
+
+# ------------------------------------------------------------------------------------------- scenes
 
 
-def meshes(paths: list[str], levels: list[int]) -> dict[str, se.Mesh]:
-    """Name -> mesh; each also subdivided 4^level-fold."""
-    paths = paths or [str(p) for p in map(data, ("bunny.obj", "armadillo.obj")) if p]
+def meshes(options):
+    """(Name, mesh) of every input, also subdivided 4^level-fold; made one after the other, they are large."""
+    names = ("bunny.obj", "armadillo.obj") if options.all else ("bunny.obj",)
+    paths = options.mesh or [str(p) for p in map(data, names) if p]
     base = {Path(p).stem: se.load_mesh(p) for p in paths} or {"knot": se.carved_knot()}
-    found = {}
     for name, mesh in base.items():
         solid = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), process=False)
-        for level in range(max(levels) + 1):
-            if level in levels:
-                found[f"{name}/{len(solid.faces)}"] = se.make_mesh(solid.vertices, solid.faces)
-            solid = solid.subdivide()
-    return found
+        for level in range(max(options.subdivide) + 1):
+            if level in options.subdivide and len(solid.faces) <= LARGEST:
+                yield name, se.make_mesh(solid.vertices, solid.faces)
+            if level < max(options.subdivide):
+                solid = solid.subdivide()
 
 
-def peers(mesh: se.Mesh, camera: se.Camera, height: int, width: int) -> dict:
-    """Calls that find the nearest face per pixel with other people's programs."""
-    calls = {}
-    inverse = np.linalg.inv(np.asarray(camera.projection, np.float64) @ np.asarray(camera.view, np.float64))
-    x, y = np.meshgrid((np.arange(width) + 0.5) * 2 / width - 1, 1 - (np.arange(height) + 0.5) * 2 / height)
-    ends = [np.stack([x, y, np.full_like(x, z), np.ones_like(x)], -1) @ inverse.T for z in (-1.0, 0.5)]
-    start, end = (e[..., :3] / e[..., 3:] for e in ends)
-    rays = np.concatenate([start, end - start], -1).astype(np.float32).reshape(-1, 6)
-    vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces)
-    try:
-        import open3d
-    except ImportError:
-        pass
-    else:
-        scene = open3d.t.geometry.RaycastingScene()
-        scene.add_triangles(open3d.core.Tensor(vertices), open3d.core.Tensor(faces.astype(np.uint32)))
-        tensor = open3d.core.Tensor(rays)
-        calls["ids: Open3D"] = lambda: scene.cast_rays(tensor)["primitive_ids"].numpy()
-    try:
-        import mitsuba
-    except ImportError:
-        pass
-    else:
-        mitsuba.set_variant("llvm_ad_rgb")
-        solid = mitsuba.Mesh("solid", len(vertices), len(faces))
-        parameters = mitsuba.traverse(solid)
-        parameters["vertex_positions"], parameters["faces"] = vertices.ravel(), faces.ravel()
-        parameters.update()
-        world = mitsuba.load_dict({"type": "scene", "solid": solid})
-        ray = mitsuba.Ray3f(mitsuba.Point3f(rays[:, :3].T), mitsuba.Vector3f(rays[:, 3:].T))
-        calls["ids: Mitsuba 3"] = lambda: np.asarray(world.ray_intersect_preliminary(ray).prim_index)
-    return calls
+def look(mesh: se.Mesh, height: int, width: int, zoom: float) -> se.Camera:
+    camera = se.frame_mesh(mesh, direction=(0.3, 0.2, 1), aspect=width / height)
+    return replace(camera, projection=camera.projection * jnp.asarray([zoom, zoom, 1, 1])[:, None])
 
 
-def scene_calls(mesh: se.Mesh, camera: se.Camera, height: int, width: int) -> dict:
+def our_calls(mesh: se.Mesh, camera: se.Camera, height: int, width: int) -> dict:
     size = {"height": height, "width": width}
     seen = se.rasterize(mesh, camera, **size)
+    distance = -(mesh.vertices @ camera.view[2, :3] + camera.view[2, 3])[:, None]
 
     @jax.jit
     def step(vertices, normals, camera):
         def loss(vertices, normals, camera):
-            moved = se.Mesh(vertices, mesh.faces, normals)
-            g = se.render_gbuffer(moved, camera, **size)
+            g = se.render_gbuffer(se.Mesh(vertices, mesh.faces, normals), camera, **size)
             return jnp.sum(g.normal[..., 2] * g.depth) + jnp.sum(g.position[..., 0])
 
         return jax.value_and_grad(loss, (0, 1, 2))(vertices, normals, camera)
 
-    return {
+    def sampled():
+        g = se.render_gbuffer(mesh, camera, **size)
+        return g, se.sample_coverage(mesh, camera, g, samples=2)
+
+    def of_ids():
+        return se.barycentrics(mesh, camera, seen), se.interpolate(distance, mesh, camera, seen)
+
+    calls = {
         "ids": lambda: se.rasterize(mesh, camera, **size),
-        "barycentrics": lambda: se.barycentrics(mesh, camera, seen),
-        "G-buffer with ids": lambda: se.render_gbuffer(mesh, camera, **size),
+        "barycentrics + depth": of_ids,
+        "G-buffer": lambda: se.render_gbuffer(mesh, camera, **size),
         "forward + backward": lambda: step(mesh.vertices, mesh.normals, camera),
+        "G-buffer samples=2": sampled,
+    }
+    return {f"{row}: {OURS}": call for row, call in calls.items()}
+
+
+# ------------------------------------------------------------------------------------------- memory
+
+
+def program(vertices: int, faces: int, height: int, width: int) -> tuple[float, float]:
+    """Bytes of temporaries and output of the visibility program, and the seconds that compiling it takes."""
+    f32, i32 = jnp.float32, jnp.int32
+    shapes = [((vertices, 3), f32), ((faces, 3), i32), ((4, 4), f32), ((4, 4), f32)]
+    lowered = visible_triangles.lower(
+        *(jax.ShapeDtypeStruct(*s) for s in shapes), height=height, width=width, cull="none"
+    )
+    start = time.perf_counter()
+    compiled = lowered.compile()
+    seconds = time.perf_counter() - start
+    stats = compiled.memory_analysis()
+    return stats.temp_size_in_bytes + stats.output_size_in_bytes, seconds
+
+
+def slopes() -> dict:
+    """What a face and a pixel more cost the visibility program."""
+    faces, height, width = 1 << 20, 1024, 1024
+    small, _ = program(faces // 2, faces, height, width)
+    more_faces, _ = program(faces, 2 * faces, height, width)
+    more_pixels, _ = program(faces // 2, faces, 2 * height, width)
+    return {
+        "bytes_per_triangle": round((more_faces - small) / faces, 1),
+        "bytes_per_pixel": round((more_pixels - small) / (height * width), 1),
+        "note": "temporaries and output of the visibility program, two triangles per vertex",
     }
 
 
-def program(mesh: se.Mesh, camera: se.Camera, height: int, width: int) -> tuple[float, float]:
-    """MiB of temporaries and output of the visibility program, and the seconds that compiling it takes."""
-    arrays = (mesh.vertices, mesh.faces, camera.view, camera.projection)
-    start = time.perf_counter()
-    compiled = visible_triangles.lower(*arrays, height=height, width=width, cull="none").compile()
-    seconds = time.perf_counter() - start
-    stats = compiled.memory_analysis()
-    return (stats.temp_size_in_bytes + stats.output_size_in_bytes) / 2**20, seconds
+def peak() -> float:
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+
+
+# ------------------------------------------------------------------------------------------- one process per core count
+
+
+def worker(options) -> None:
+    """Everything on one number of cores; rows as JSON into a file."""
+    rows: list[dict] = []
+    missing: dict[str, str] = {}
+    for name, mesh in meshes(options):
+        for size in options.sizes:
+            for zoom in options.zoom:
+                width, height = map(int, size.split("x"))
+                rows += scene_rows(options, name, mesh, height, width, zoom, missing)
+    found = {"rows": rows, "missing": missing, "memory": slopes() if options.worker == max(options.cores) else {}}
+    Path(options.file).write_text(json.dumps(found))
+
+
+def scene_rows(options, name, mesh, height, width, zoom, missing) -> list[dict]:
+    camera = look(mesh, height, width, zoom)
+    triangles = int(mesh.faces.shape[0])
+    held, seconds = program(mesh.vertices.shape[0], triangles, height, width)
+    covered = float(jnp.mean(se.rasterize(mesh, camera, height=height, width=width).triangle >= 0))
+    calls = our_calls(mesh, camera, height, width)
+    if options.prototype:
+        calls |= peers.prototype(Path(options.prototype), mesh, camera, height, width)
+    others, absent = peers.calls(mesh, camera, height, width) if not options.no_peers else ({}, {})
+    missing |= absent
+    about = {"cores": options.worker, "mesh": name, "triangles": triangles, "size": f"{width}x{height}"}
+    about |= {"covered": round(covered, 2)}
+    rows = []
+    for call, times in measure({**calls, **others}, repeats=options.repeats, seconds=options.seconds).items():
+        row, who = call.split(": ")
+        rows.append({**about, "call": row, "by": who, **times})
+        if row == "ids" and who == OURS:
+            rows[-1] |= {"compile_s": round(seconds, 2), "program_MiB": round(held / 2**20, 1), "peak_MiB": peak()}
+    print(table(rows), flush=True)
+    return rows
+
+
+def run_workers(options) -> dict:
+    found: dict = {"rows": [], "missing": {}, "memory": {}}
+    with tempfile.TemporaryDirectory() as folder:
+        for cores in options.cores:
+            file = Path(folder) / f"{cores}.json"
+            command = [sys.executable, "-m", "benchmarks.raster", *sys.argv[1:], "--worker", str(cores)]
+            environment = os.environ | {
+                "JAX_COMPILATION_CACHE_DIR": str(Path(folder) / "cache"),
+                "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            }
+            subprocess.run([*command, "--file", str(file)], check=True, env=environment)
+            part = json.loads(file.read_text())
+            found["rows"] += part["rows"]
+            found["missing"] |= part["missing"]
+            found["memory"] |= part["memory"]
+    return found
+
+
+# ------------------------------------------------------------------------------------------- what is told
+
+
+def plot(rows: list[dict]) -> Path | None:
+    """`results/raster.png`: milliseconds against triangles per peer, ids and G-buffer, first size and cores."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        print("no plot: matplotlib is missing (pip install shapeenh[bench])")
+        return None
+    first = rows[0]
+    kinds = ("ids", "G-buffer")
+    figure = Figure(figsize=(10, 4.5), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, kind in zip(panels, kinds, strict=True):
+        chosen = [r for r in rows if r["call"] == kind and r["size"] == first["size"] and r["cores"] == first["cores"]]
+        for who in dict.fromkeys(r["by"] for r in chosen):
+            points = sorted((r["triangles"], r["median_ms"]) for r in chosen if r["by"] == who)
+            axes.plot(*zip(*points, strict=True), "o-", label=who, linewidth=3 if who == OURS else 1)
+        axes.set(
+            xscale="log", yscale="log", xlabel="triangles", title=f"{kind}, {first['size']}, {first['cores']} cores"
+        )
+        axes.grid(alpha=0.3, which="both")
+        axes.legend(fontsize=8)
+    panels[0].set_ylabel("milliseconds")
+    RESULTS.mkdir(exist_ok=True)
+    path = RESULTS / "raster.png"
+    figure.savefig(path, dpi=100)
+    return path
+
+
+def ratios(rows: list[dict]) -> list[dict]:
+    """Per scene and call: a peer's time over ours, of the same run."""
+    keys = ("cores", "mesh", "triangles", "size", "covered", "call")
+    ours = {tuple(r[k] for k in keys): r["median_ms"] for r in rows if r["by"] == OURS}
+    out: dict[tuple, dict] = {}
+    for r in rows:
+        key = tuple(r[k] for k in keys)
+        if r["by"] != OURS and key in ours:
+            line = out.setdefault(key, dict(zip(keys, key, strict=True)) | {"ours_ms": ours[key]})
+            line[f"{r['by']} / ours"] = round(r["median_ms"] / ours[key], 2)
+    names = list(dict.fromkeys(k for line in out.values() for k in line))
+    return [{k: line.get(k) for k in names} for line in out.values()]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("mesh", nargs="*")
-    parser.add_argument("--sizes", nargs="+", default=["800x600", "1920x1080"])
-    parser.add_argument("--subdivide", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--sizes", nargs="+")
+    parser.add_argument("--subdivide", nargs="+", type=int)
+    parser.add_argument("--zoom", nargs="+", type=float)
+    parser.add_argument("--cores", nargs="+", type=int)
     parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--seconds", type=float, default=6.0, help="at most, per scene")
+    parser.add_argument("--prototype", metavar="FOLDER")
+    parser.add_argument("--no-peers", action="store_true")
+    parser.add_argument("--all", action="store_true")
+    parser.add_argument("--worker", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--file", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    rows = []
-    for name, mesh in meshes(options.mesh, options.subdivide).items():
-        for size in options.sizes:
-            width, height = map(int, size.split("x"))
-            camera = se.frame_mesh(mesh, direction=(0.3, 0.2, 1), aspect=width / height)
-            mib, seconds = program(mesh, camera, height, width)
-            covered = float(jnp.mean(se.rasterize(mesh, camera, height=height, width=width).triangle >= 0))
-            calls = {**scene_calls(mesh, camera, height, width), **peers(mesh, camera, height, width)}
-            for call, times in measure(calls, repeats=options.repeats).items():
-                about = {"mesh": name, "size": size, "covered": round(covered, 2), "call": call}
-                rows.append({**about, **times, "ids_compile_s": round(seconds, 2), "ids_MiB": round(mib, 1)})
-            print(table(rows[-len(calls) :]), flush=True)
-    print(table(rows))
-    print(write("raster", rows))
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    sizes = ["800x600", "1920x1080"]
+    options.sizes = options.sizes or (["256x256", *sizes, "3840x2160"] if options.all else sizes)
+    options.subdivide = options.subdivide or ([0, 1, 2, 3] if options.all else [0, 1])
+    options.zoom = options.zoom or ([1.0, 3.0] if options.all else [1.0])
+    options.cores = options.cores or ([2, 1] if available >= 2 else [1])
+    if options.worker:
+        if hasattr(os, "sched_setaffinity"):
+            os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: options.worker])
+        worker(options)
+        return
+    found = run_workers(options)
+    print(table(ratios(found["rows"])))
+    for name, why in found["missing"].items():
+        print(f"not here: {name} ({why})")
+    print(found["memory"])
+    print(plot(found["rows"]))
+    print(write("raster", found["rows"], memory=found["memory"], missing=found["missing"]))
 
 
 if __name__ == "__main__":
