@@ -254,6 +254,79 @@ def test_a_contrast_that_rises_and_falls_is_met_from_any_start(start, target):
     assert fitted.renders <= 30
 
 
+# ------------------------------------------------------------------------------------------- every parameter
+
+DEFAULTS = {
+    "alpha": 20.0,
+    "contrast": 0.2,
+    "sigma": 1.0,
+    "invariant": 0.4,
+    "gamma": 4.0,
+    "anisotropy": 0.2,
+    "rotation": 0.0,
+    "intensity": 1.0,
+}
+RANGES = {
+    "alpha": (0.0, 60.0),
+    "contrast": (-0.8, 0.8),
+    "sigma": (0.3, 3.0),
+    "invariant": (0.1, 0.8),
+    "gamma": (0.0, 12.0),
+    "anisotropy": (-1.0, 1.0),
+    "rotation": (-0.6, 0.6),
+    "intensity": (0.2, 5.0),
+}
+
+
+@pytest.fixture(scope="module")
+def whole_picture():
+    """(parameters -> picture, mask): a ring, warped and scaled, its lights turned, one of them made brighter."""
+    mesh = se.torus(segments=24)
+    camera = se.frame_mesh(mesh, direction=(0.2, 0.9, 0.7), aspect=4 / 3)
+    gbuffer = se.render_gbuffer(mesh, camera, height=24, width=32)
+    lights = se.rotate_lights(se.sample_environment(se.procedural_studio(), 8), camera)
+    material = se.named_material("stone")
+    brightest = jnp.argmax(jnp.sum(lights.radiance, axis=-1))
+
+    @jax.jit
+    def picture(p):
+        c, s = jnp.cos(p["rotation"]), jnp.sin(p["rotation"])
+        x, y, z = lights.direction.T
+        turned = jnp.stack([c * x + s * z, y, c * z - s * x], axis=-1)
+        lit = se.Lights(turned, lights.radiance.at[brightest].multiply(p["intensity"]))
+        return se.shade_scaled(
+            gbuffer,
+            se.describe(gbuffer, sigma=p["sigma"], scheme="explicit"),
+            lit,
+            material,
+            invariant=p["invariant"],
+            gamma_diffuse=p["gamma"],
+            gamma_specular=p["gamma"],
+            anisotropy=p["anisotropy"],
+            alpha=p["alpha"],
+            contrast=p["contrast"],
+        )
+
+    return picture, np.asarray(gbuffer.mask)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("names", [("sigma",), ("rotation",), tuple(DEFAULTS)])
+def test_parameters_of_every_stage_are_fitted_singly_and_together(names, whole_picture):
+    """The target is the contrast at a hidden value; another value may reach it too, so the contrast is compared."""
+    picture, mask = whole_picture
+    bounds = {name: RANGES[name] for name in names}
+    hidden = {name: low + 0.7 * (high - low) for name, (low, high) in bounds.items()}
+    target = float(se.contrast(picture(DEFAULTS | hidden), mask))
+    start = {name: low + 0.2 * (high - low) for name, (low, high) in bounds.items()}
+    render = lambda p: picture({k: jnp.asarray(v, jnp.float32) for k, v in (DEFAULTS | p).items()})  # noqa: E731
+    fitted = se.fit_contrast(render, target, start, mask=mask, bounds=bounds)
+    assert fitted.converged
+    assert float(se.contrast(render(fitted.parameters), mask)) == pytest.approx(target, rel=1.1e-4)
+    for name, (low, high) in bounds.items():
+        assert low <= fitted.parameters[name] <= high
+
+
 SLOW_TO_COMPILE = [pytest.param(name, marks=pytest.mark.slow) for name in ("lbfgsb", "projected")]
 
 
