@@ -178,6 +178,50 @@ def test_composition_is_the_over_operator():
     np.testing.assert_allclose(se.composite_lines(picture, strokes)[0, 0], [0.475, 0.375, 0.575], rtol=1e-6)
 
 
+# ------------------------------------------------------------------------------------------- silhouettes
+
+
+def two_sheets(edge):
+    """(gbuffer, descriptor) of a flat sheet before another one; `edge` [H, W]: where the one in front is seen."""
+    depth = np.where(edge, 5.0, 8.0).astype(np.float32)
+    position = np.stack([X, Y, -depth * SIZE], -1).astype(np.float32)
+    normal = np.broadcast_to(np.float32([0, 0, 1]), (SIZE, SIZE, 3))
+    mask = jnp.ones((SIZE, SIZE), bool)
+    gbuffer = GBuffer(mask, jnp.asarray(depth * SIZE), jnp.asarray(normal), jnp.asarray(position))
+    return gbuffer, se.describe(gbuffer)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_nothing_is_drawn_across_a_silhouette(turned):
+    """A wide brush along a line that crosses the edge of a sheet, drawn on the one in front, or on the one behind."""
+    edge = (X + 0.4 * Y < 3) if turned else (X < 3)
+    gbuffer, descriptor = two_sheets(edge)
+    brush = se.Brush(radius=5.0, color=(0.5, 0.2, 0.1))
+    profile, field = straight(angle=0.3)
+    for own in (edge, ~edge):
+        drawn = replace(profile, valid=profile.valid & jnp.asarray(own))
+        free = np.asarray(se.draw_lines(drawn, field, brush))
+        held = np.asarray(se.draw_lines(drawn, field, brush, gbuffer=gbuffer, descriptor=descriptor))
+        assert free[~own, 3].max() > 0.5  # it would spill over
+        assert not np.any(held[~own])
+        kept = np.abs(held - free)[own][:, 3] < 1e-6
+        assert np.mean(kept) > (0.97 if turned else 1 - 1e-9)  # and nothing else changes
+        traced = jax.jit(lambda p: se.draw_lines(p, field, brush, gbuffer=gbuffer, descriptor=descriptor))(drawn)
+        np.testing.assert_allclose(traced, held, atol=2e-5)
+
+
+def test_nothing_is_drawn_off_the_mask():
+    gbuffer, _ = two_sheets(X < 100)
+    gbuffer = replace(gbuffer, mask=jnp.asarray(Y < 2))
+    profile, field = straight()
+    args = {"gbuffer": gbuffer, "descriptor": se.describe(gbuffer)}
+    got = np.asarray(se.draw_lines(profile, field, se.Brush(radius=4.0), **args))
+    assert got[Y < 2].max() > 0.5
+    drawn_on = Profile(*(getattr(profile, n) for n in ("distance", "height", "curvature")), profile.valid & (Y < 2))
+    got = np.asarray(se.draw_lines(drawn_on, field, se.Brush(radius=4.0), **args))
+    assert not np.any(got[Y > 2])
+
+
 # ------------------------------------------------------------------------------------------- noise
 
 

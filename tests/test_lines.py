@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import ndimage
 
 import shapeenh as se
 from shapeenh.types import GBuffer, replace
@@ -68,14 +69,30 @@ def test_heights_are_those_of_the_table():
     d = se.describe(gbuffer)
     k1, k2 = se.principal_curvatures(d.hessian)
     height = {k: se.line_field(k, gbuffer, d, sigma=0.0).height for k in ("ridge", "valley", "surface")}
-    np.testing.assert_allclose(height["ridge"], -k2, atol=1e-6)
-    np.testing.assert_allclose(height["valley"], k1, atol=1e-6)
-    np.testing.assert_allclose(height["surface"], np.hypot(d.gradient[..., 0], d.gradient[..., 1]), atol=1e-6)
     hm = np.asarray(se.mean_curvature(d.hessian))
+    assert np.mean(hm < 0) > 0.5
+    np.testing.assert_allclose(np.where(hm <= 0, height["ridge"] + k2, 0), 0, atol=1e-6)
+    np.testing.assert_allclose(np.where(hm >= 0, height["valley"] - k1, 0), 0, atol=1e-6)
+    np.testing.assert_allclose(height["surface"], np.hypot(d.gradient[..., 0], d.gradient[..., 1]), atol=1e-6)
     expected = np.hypot(*np.gradient(hm))[4:-4, 4:-4]
     inflection = np.asarray(se.line_field("inflection", gbuffer, d, sigma=0.0).height)[4:-4, 4:-4]
     # ours averages 1:4:1 across, numpy does not: second order apart
     np.testing.assert_allclose(inflection, expected, atol=0.05 * expected.max())
+
+
+def test_the_stronger_curvature_of_a_saddle_is_a_line_and_the_weaker_is_none():
+    """(concave, convex): heights fall from equality on, and are 0 where the other is 1.5 times as strong."""
+    for a, b, ridge, valley in (
+        (0.3, 0.1, 0.0, 0.3),
+        (0.3, 0.3, 0.3, 0.3),
+        (0.24, 0.3, 0.3, 0.12),
+        (0.2, 0.3, 0.3, 0.0),
+    ):
+        hessian = np.broadcast_to(np.float32([a, 0, -b]), (9, 9, 3))
+        d = se.Descriptor(jnp.asarray(hessian), jnp.zeros((9, 9, 2)), *(jnp.zeros((9, 9)) for _ in range(3)))
+        gbuffer = GBuffer(jnp.ones((9, 9), bool), *(jnp.ones((9, 9, *s)) for s in ((), (3,), (3,))))
+        for kind, expected in (("ridge", ridge), ("valley", valley)):
+            np.testing.assert_allclose(se.line_field(kind, gbuffer, d, sigma=0.0).height, expected, atol=1e-6)
 
 
 def test_inflections_run_where_the_curvature_changes_sign():
@@ -131,6 +148,52 @@ def test_planes_have_no_lines_of_any_kind():
     d = se.describe(gbuffer, sigma=1.0)
     for kind in ("ridge", "valley", "inflection", "surface"):
         assert not np.any(se.fit_profile(se.line_field(kind, gbuffer, d)).valid), kind
+
+
+# ------------------------------------------------------------------------------------------- a mesh
+
+
+@pytest.fixture(scope="module")
+def knot():
+    """The embedded object, which has grooves, bumps, limbs and parts that hide others: (gbuffer, descriptor)."""
+    mesh = se.carved_knot()
+    camera = se.frame_mesh(mesh, direction=(0.34, 0.26, 0.9), aspect=1.0)
+    gbuffer = se.render_gbuffer(mesh, camera, height=360, width=360)
+    return gbuffer, se.describe(gbuffer, sigma=1.2)
+
+
+def skeleton(profile):
+    return np.asarray(profile.valid) & (np.abs(profile.distance) <= 0.5)
+
+
+@pytest.mark.parametrize(("kind", "sign"), [("ridge", -1), ("valley", 1)])
+def test_strong_lines_of_a_mesh_lie_on_their_side_of_flat(kind, sign, knot):
+    gbuffer, descriptor = knot
+    strong = float(se.style_brush("ink", kind, height=360).high)
+    found = se.fit_profile(se.line_field(kind, gbuffer, descriptor), least=strong)
+    on = skeleton(found)
+    assert on.sum() > 300
+    assert np.mean(sign * np.asarray(se.mean_curvature(descriptor.hessian))[on] > 0) >= 0.95
+
+
+def test_occlusion_lines_of_a_mesh_lie_within_a_pixel_of_its_depth_steps(knot):
+    gbuffer, descriptor = knot
+    found = se.fit_profile(se.line_field("occlusion", gbuffer, descriptor), radius=3.0, least=0.05)
+    mask, depth = np.asarray(gbuffer.mask), np.asarray(gbuffer.depth)
+    seen = np.where(mask, depth, 10 * depth.max())
+    # steps of 2 % of the object's depth, ten pixels' worth, by a plain difference
+    large = 0.02 * np.ptp(depth[mask])
+    steps = np.zeros_like(mask)
+    for axis in (0, 1):
+        jump = np.abs(np.diff(seen, axis=axis)) > large
+        pair = [np.s_[:-1, :], np.s_[1:, :]] if axis == 0 else [np.s_[:, :-1], np.s_[:, 1:]]
+        for side in pair:
+            steps[side] |= jump
+    on = skeleton(found)
+    assert on.sum() > 1000
+    assert np.mean(ndimage.distance_transform_edt(~steps)[on] <= 1) > 0.95  # the others are on smaller steps
+    outline = mask & ~ndimage.binary_erosion(mask, border_value=1)
+    assert np.mean(ndimage.distance_transform_edt(~on)[outline] <= 1.5) > 0.98
 
 
 # ------------------------------------------------------------------------------------------- singularities, smoothing

@@ -10,24 +10,21 @@ T_x a similarity that orients and scales it. Sums are premultiplied RGBA; 1 - ex
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.tree_util import register_dataclass
 
 from shapeenh.checks import check_range, check_shape, check_size, check_type, float_dtype, is_concrete
+from shapeenh.lines.accumulate import draw_everywhere, draw_listed, list_runs
+from shapeenh.lines.fields import depth_barriers
 from shapeenh.lines.noise import CHANNELS
-from shapeenh.lines.profile import _read
-from shapeenh.numerics import safe_divide, safe_hypot, safe_sqrt, smoothstep
-from shapeenh.types import LineField, Profile
+from shapeenh.lines.stamps import FOOTPRINTS, stamps_of
+from shapeenh.types import Descriptor, GBuffer, LineField, Profile
 
-FOOTPRINTS = ("disc", "ellipse")
 LARGEST_REACH = 64
-_CUT = 1e-3  # taken off all weights, so that stamps fainter than this are none
-_LADDER = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
+_LADDER = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, 32, 48, 64)
 
 
 @register_dataclass
@@ -64,7 +61,18 @@ class Brush:
     wobble: jax.Array | float = 0.0
 
 
-def draw_lines(profile, field, brush, *, footprint="disc", shading=None, noise=None, reach: int | None = None):
+def draw_lines(
+    profile,
+    field,
+    brush,
+    *,
+    footprint="disc",
+    shading=None,
+    noise=None,
+    gbuffer=None,
+    descriptor=None,
+    reach: int | None = None,
+):
     """The picture that a brush leaves along the lines of a field.
 
     Source: TH10 8.1 (eqs. 8.1 to 8.3); SPEC 10.
@@ -78,9 +86,13 @@ def draw_lines(profile, field, brush, *, footprint="disc", shading=None, noise=N
             to opacity [...] or RGBA [..., 4]. RGB of images and functions multiplies the brush's colour.
         shading: [H, W, 3] linear RGB, for brushes with `shade` > 0; or None.
         noise: [H, W, 4] in [0, 1] (paper, gaps, tint, wobble), such as `surface_noise`; or None.
+        gbuffer, descriptor: those of the field, or None. With them footprints end at the outline and at steps of depth,
+            as if each surface were drawn on its own sheet; TH10 lets them spill over. Not for occlusion lines, which
+            straddle the steps.
         reach: px, how far stamps may extend, 1 to 64; read off the brush if that is concrete, and required if not.
 
-    Static: footprint where it is no image, reach (rounded up a ladder), which arguments are None.
+    Static: footprint where it is no image, reach (rounded up a ladder), which arguments are None, and, of a concrete
+        brush, whether it grows, wobbles, and has more than one colour: what it does not do costs nothing.
     Returns: [H, W, 4], premultiplied linear RGBA, alpha in [0, 1[; 0 where nothing is drawn.
         `picture * (1 - alpha) + rgb` lays it over a picture.
     Gradient: with respect to profile, brush, shading, noise and footprint image.
@@ -102,21 +114,41 @@ def draw_lines(profile, field, brush, *, footprint="disc", shading=None, noise=N
         check_shape("noise", noise, (*shape, CHANNELS))
         noise = jnp.clip(jnp.nan_to_num(jnp.asarray(noise, dtype), nan=0.5), 0, 1)
     _check_brush(brush, shading, noise)
+    barriers = _barriers(gbuffer, descriptor, shape)
     image, function = _footprint(footprint, dtype)
-    reach = _reach(brush, reach)
+    reach = _reach(brush, reach, corners=function not in FOOTPRINTS)
+    concrete = is_concrete(profile, field, brush, shading, noise, image, barriers)
+    wants = _wants(brush, shading, noise, function) if concrete else {}
     brush = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), brush, is_leaf=lambda leaf: isinstance(leaf, tuple))
-    if not is_concrete(profile, field, brush, shading, noise, image):
-        return _draw_everywhere(profile, field, brush, shading, noise, image, function=function, reach=reach)
-    stamps = _stamps_of(profile, field, brush, shading, noise)
-    size = shape[0] * shape[1]
-    index = np.flatnonzero(np.asarray(stamps[0]).ravel() > 0)
-    chunk = max(64, min(4096, (1 << 18) // (2 * reach + 1) ** 2))
-    listed = np.zeros(chunk * (size // chunk + 1), np.int32)
-    listed[: index.size] = index
-    count = jnp.asarray(index.size, jnp.int32)
-    return _draw_listed(
-        stamps, jnp.asarray(listed), count, brush, noise, image, function=function, reach=reach, chunk=chunk
-    )
+    options = {"function": function, "reach": reach}
+    if not concrete:
+        return draw_everywhere(profile, field, brush, shading, noise, image, barriers, **options)
+    stamps = stamps_of(profile, field, brush, shading, noise, **wants)
+    listed, counts = list_runs(stamps.weight, barriers, reach)
+    return draw_listed(stamps, listed, counts, brush, noise, image, barriers, **options)
+
+
+def _wants(brush, shading, noise, function) -> dict[str, bool]:
+    """Which planes of the stamps differ from pixel to pixel."""
+    shaded = shading is not None and float(brush.shade) > 0
+    tinted, moved = (noise is not None and float(strength) > 0 for strength in (brush.tint, brush.wobble))
+    return {
+        "colored": shaded or tinted,
+        "turned": function != "disc",
+        "moved": moved,
+        "grown": float(brush.grow) > 0,
+    }
+
+
+def _barriers(gbuffer, descriptor, shape):
+    """Where footprints end, between the pixels; or None."""
+    if gbuffer is None and descriptor is None:
+        return None
+    check_type("gbuffer", gbuffer, GBuffer)
+    check_type("descriptor", descriptor, Descriptor)
+    check_shape("gbuffer.depth", gbuffer.depth, shape)
+    check_shape("descriptor.silhouette", descriptor.silhouette, shape)
+    return depth_barriers(gbuffer, descriptor)
 
 
 def _check_brush(brush, shading, noise) -> None:
@@ -159,156 +191,14 @@ def _footprint(footprint, dtype):
     return jnp.asarray(footprint, dtype), "image"
 
 
-def _reach(brush, reach) -> int:
+def _reach(brush, reach, *, corners: bool) -> int:
     if reach is not None:
         return next(r for r in _LADDER if r >= check_size("reach", reach, high=LARGEST_REACH))
     if not is_concrete(brush.radius, brush.wobble):
         raise ValueError("reach is None with a traced brush; accepted is a number of px, since it decides array sizes")
     # the corner of a turned square lies sqrt(2) times as far away, and anti-aliasing adds half a pixel
-    needed = np.sqrt(2) * float(brush.radius) + float(brush.wobble) + 0.5
+    needed = (np.sqrt(2) if corners else 1) * float(brush.radius) + float(brush.wobble) + 0.5
     return next((r for r in _LADDER if r >= needed), LARGEST_REACH)
-
-
-# ------------------------------------------------------------------------------------------- weights (8.2), T_x (8.3)
-
-
-def _stamps(profile, field, brush, shading, noise):
-    """`[9, H, W]`: weight, colour (3), the first row of T_x (2), the stamp's shift (2), its radius."""
-    height, distance = profile.height, profile.distance
-    rise = smoothstep(brush.low, brush.high, height)
-    if noise is None:
-        gaps = tint = wobble = jnp.zeros_like(height)
-    else:
-        gaps, tint = brush.gaps * noise[..., 1], brush.tint * (noise[..., 2] - 0.5)
-        wobble = 2 * brush.wobble * (noise[..., 3] - 0.5)
-    profile_width = safe_sqrt(safe_divide(jnp.maximum(height, 0), -profile.curvature))
-    s = jnp.minimum(brush.width + brush.spread * profile_width, 64)
-    bell = jnp.maximum(rise * jnp.exp(-0.5 * (distance / s) ** 2) - _CUT, 0)  # lambda exp(-d^2 / 2 s^2)
-    radius = brush.radius * (1 - brush.grow + brush.grow * rise)
-    usable = profile.valid & (radius > 1e-3)
-    radius = jnp.where(usable, radius, 1)
-
-    # What a straight line of such stamps adds up to: its length times its width, or the footprint, if that is smaller.
-    line, whole = 2 * radius * np.sqrt(2 * np.pi).item() * s, np.pi * radius * radius * brush.aspect
-    total = line * whole / safe_hypot(line, whole)
-    weight = brush.flow * (1 - smoothstep(0.3, 0.7, gaps)) * bell / total
-    weight = jnp.where(usable, weight, 0)
-
-    theta_x, theta_y = field.direction[..., 0], field.direction[..., 1]
-    color = jnp.broadcast_to(brush.color[:, None, None], (3, *height.shape))
-    if shading is not None:
-        color = color + brush.shade * (_at_skeleton(shading, distance, theta_x, theta_y) - color)
-    color = jnp.maximum(color * (1 + 2 * tint)[None] + jnp.maximum(tint, 0)[None] * 0.2, 0)
-    turn = jnp.stack([-theta_y, theta_x]) / radius[None]
-    moved = jnp.stack([wobble * theta_x, wobble * theta_y])
-    return jnp.concatenate([weight[None], color, turn, moved, radius[None]])
-
-
-_stamps_of = jax.jit(_stamps)
-
-
-def _at_skeleton(shading, distance, theta_x, theta_y):
-    """The shading where the skeleton is, `[3, H, W]`."""
-    h, w = distance.shape
-    row = lax.broadcasted_iota(jnp.int32, (h, w), 0).astype(distance.dtype)
-    col = lax.broadcasted_iota(jnp.int32, (h, w), 1).astype(distance.dtype)
-    row, col = row - distance * theta_y, col + distance * theta_x
-    padded = jnp.pad(jnp.where(jnp.isfinite(shading), shading, 0), ((1, 1), (1, 1), (0, 0)), mode="edge")
-    return jnp.stack([_read(padded[..., i], row, col) for i in range(3)])
-
-
-# ------------------------------------------------------------------------------------------- footprints f
-
-
-def _imprint(stamp, x, y, aspect, image, function):
-    """Premultiplied RGBA planes (list of four) that stamps leave at the offset (x, y) from them; y up."""
-    weight, red, green, blue, cos, sin, dx, dy, radius = stamp
-    x, y = x - dx, y - dy
-    u, v = cos * x + sin * y, cos * y - sin * x
-    if isinstance(function, str) and function in FOOTPRINTS:
-        r = safe_hypot(u, v / aspect if function == "ellipse" else v)
-        alpha = jnp.clip((1 - r) * radius * (aspect if function == "ellipse" else 1) + 0.5, 0, 1)
-        rgb = [1.0, 1.0, 1.0]
-    else:
-        inside = (jnp.abs(u) <= 1) & (jnp.abs(v) <= 1)
-        u, v = jnp.where(inside, u, 0), jnp.where(inside, v, 0)
-        rgba = _sample(image, u, v) if function == "image" else function(u, v)
-        colored = rgba.ndim > u.ndim
-        rgb = [rgba[..., i] for i in range(3)] if colored else [1.0, 1.0, 1.0]
-        alpha = jnp.where(inside, rgba[..., 3] if colored else rgba, 0)
-    alpha = weight * alpha
-    return [alpha * c * f for c, f in zip((red, green, blue), rgb, strict=True)] + [alpha]
-
-
-def _sample(image, u, v):
-    """Bilinear RGBA at u (along the columns), v (up) in [-1, 1]; colours are weighted by their opacity."""
-    h, w = image.shape[:2]
-    row, col = 0.5 * (1 - v) * h - 0.5, 0.5 * (1 + u) * w - 0.5
-    alpha = image[..., 3]
-    planes = [jnp.pad(p, 1, mode="edge") for p in (*(image[..., i] * alpha for i in range(3)), alpha)]
-    red, green, blue, a = (_read(p, row, col) for p in planes)
-    return jnp.stack([*(safe_divide(c, a) for c in (red, green, blue)), a], axis=-1)
-
-
-# ------------------------------------------------------------------------------------------- the sum (8.1)
-
-
-@partial(jax.jit, static_argnames=("function", "reach", "chunk"))
-def _draw_listed(stamps, listed, count, brush, noise, image, *, function, reach, chunk):
-    """Stamps of the listed pixels alone, each added as one window of the canvas."""
-    _, h, w = stamps.shape
-    side = 2 * reach + 1
-    flat = stamps.reshape(9, h * w)
-    y = (reach - jnp.arange(side, dtype=flat.dtype))[None, :, None]
-    x = (jnp.arange(side, dtype=flat.dtype) - reach)[None, None, :]
-    numbers = lax.ScatterDimensionNumbers(
-        update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1)
-    )
-
-    def add(k, canvas):
-        index = lax.dynamic_slice_in_dim(listed, k * chunk, chunk)
-        used = k * chunk + lax.iota(jnp.int32, chunk) < count
-        stamp = [flat[i][index][:, None, None] for i in range(9)]
-        stamp[0] = jnp.where(used[:, None, None], stamp[0], 0)
-        planes = _imprint(stamp, x, y, brush.aspect, image, function)
-        windows = jnp.stack(jnp.broadcast_arrays(*planes), axis=-1).reshape(chunk, side, side * 4)
-        corner = jnp.stack([index // w, index % w * 4], axis=-1)
-        return lax.scatter_add(canvas, corner, windows, numbers, mode="promise_in_bounds")
-
-    canvas = jnp.zeros((h + 2 * reach, (w + 2 * reach) * 4), flat.dtype)
-    canvas = lax.fori_loop(0, (count + chunk - 1) // chunk, add, canvas)
-    canvas = canvas.reshape(h + 2 * reach, w + 2 * reach, 4)[reach : reach + h, reach : reach + w]
-    return _compress(jnp.moveaxis(canvas, -1, 0), brush, noise)
-
-
-@partial(jax.jit, static_argnames=("function", "reach"))
-def _draw_everywhere(profile, field, brush, shading, noise, image, *, function, reach):
-    """All pixels stamp, one offset of the footprint after another: has a gradient, but costs area times footprint."""
-    stamps = _stamps(profile, field, brush, shading, noise)
-    _, h, w = stamps.shape
-    side = 2 * reach + 1
-
-    @jax.checkpoint
-    def add(canvas, k):
-        row, col = k // side, k % side
-        x, y = (col - reach).astype(stamps.dtype), (reach - row).astype(stamps.dtype)
-        planes = jnp.stack(jnp.broadcast_arrays(*_imprint(list(stamps), x, y, brush.aspect, image, function)))
-        here = lax.dynamic_slice(canvas, (jnp.zeros_like(row), row, col), (4, h, w))
-        return lax.dynamic_update_slice(canvas, here + planes, (jnp.zeros_like(row), row, col)), None
-
-    canvas = jnp.zeros((4, h + 2 * reach, w + 2 * reach), stamps.dtype)
-    canvas, _ = lax.scan(add, canvas, jnp.arange(side * side, dtype=jnp.int32))
-    return _compress(canvas[:, reach : reach + h, reach : reach + w], brush, noise)
-
-
-def _compress(total, brush, noise):
-    """`[H, W, 4]`: paper, then all four channels by one factor, so that alpha = 1 - exp(-I_a) and colours stay."""
-    if noise is not None:
-        total = total * (1 - brush.paper * noise[..., 0])[None]
-    depth = total[3]
-    small = depth < 1e-4
-    factor = jnp.where(small, 1 - 0.5 * depth, -jnp.expm1(-depth) / jnp.where(small, 1, depth))
-    return jnp.moveaxis(total * factor[None], 0, -1)
 
 
 def composite_lines(picture, strokes):

@@ -1,0 +1,204 @@
+"""The sum of all stamps, I(y) = sum over x of w(x) f(T_x(y - x)), and its compression (TH10 8.1, SPEC 10).
+
+Pixels gather: each looks at the stamps around it. Only runs of 64 pixels that a stamp can reach are looked at, offset
+by offset, on contiguous memory; so the cost is the number of pixels near lines times that of a footprint.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from shapeenh.fusion import stored, unknown_truth
+from shapeenh.lines.stamps import Stamps, imprint, stamps_planes, tinted
+
+LANES = 64
+GROUP = 128  # runs per step: what they read stays in the cache
+
+# ------------------------------------------------------------------------------------------- barriers
+#
+# Footprints end at barriers between pixels. Crossings are counted along rows and columns: two pixels of a row have none
+# between them if their counts are equal. A stamp reaches a pixel if one of the two ways around the rectangle between
+# them, first along the row or first along the column, is free.
+
+
+def crossings(barriers):
+    """(along the rows, along the columns), [H, W] int32: how many barriers lie before each pixel."""
+    across, down = barriers
+    count = lambda closed, axis: jnp.cumsum(closed.astype(jnp.int32), axis=axis)  # noqa: E731
+    return jnp.pad(count(across, 1), ((0, 0), (1, 0))), jnp.pad(count(down, 0), ((1, 0), (0, 0)))
+
+
+def _free(stamp, pixel, row_of_stamp, row_of_pixel):
+    """Whether no barrier separates two pixels, from the crossings at both and at the rectangle's other corners.
+
+    Each is a pair (along rows, along columns). row_of_stamp: in the stamp's row and the pixel's column; row_of_pixel:
+    in the pixel's row and the stamp's column.
+    """
+    along_column_first = (row_of_pixel[1] == stamp[1]) & (row_of_pixel[0] == pixel[0])
+    along_row_first = (row_of_stamp[0] == stamp[0]) & (row_of_stamp[1] == pixel[1])
+    return along_column_first | along_row_first
+
+
+# ------------------------------------------------------------------------------------------- which runs
+
+
+def list_runs(weight, barriers, reach: int):
+    """(runs [n] int32, how many of them [2] int32): first those without barriers within reach, then those with."""
+    h, w = weight.shape
+    near = _near(np.asarray(weight) > 0, reach)
+    if barriers is None:
+        cut = np.zeros_like(near)
+    else:
+        closed = np.zeros((h, w), bool)
+        closed[:, :-1] |= np.asarray(barriers[0])
+        closed[:-1] |= np.asarray(barriers[1])
+        cut = _near(closed, reach + 1)
+    free, held = np.flatnonzero(near & ~cut), np.flatnonzero(near & cut)
+    listed = np.zeros(near.size + 2 * GROUP, np.int32)  # one size per image: nothing recompiles
+    start = -(-free.size // GROUP) * GROUP
+    for first, runs in ((0, free), (start, held)):
+        whole = -(-runs.size // GROUP) * GROUP
+        listed[first : first + whole] = np.pad(runs, (0, whole - runs.size), mode="edge") if runs.size else 0
+    return jnp.asarray(listed), jnp.asarray([start // GROUP, -(-held.size // GROUP)], jnp.int32)
+
+
+def _near(flags: np.ndarray, reach: int) -> np.ndarray:
+    """[H, runs per row]: which runs have a flag within `reach` rows and columns."""
+    h, w = flags.shape
+    runs = -(-w // LANES)
+    block = np.pad(flags, ((0, 0), (0, runs * LANES - w))).reshape(h, runs, LANES)
+    any_ = np.asarray(block.any(axis=2))
+    any_[:, 1:] |= block[:, :-1, -reach:].any(axis=2)
+    any_[:, :-1] |= block[:, 1:, :reach].any(axis=2)
+    total = np.cumsum(np.pad(any_, ((reach + 1, reach), (0, 0))), axis=0)
+    return total[2 * reach + 1 :] > total[: -2 * reach - 1]
+
+
+# ------------------------------------------------------------------------------------------- the sum (8.1)
+
+
+@partial(jax.jit, static_argnames=("function", "reach"))
+def draw_listed(stamps: Stamps, listed, counts, brush, noise, image, barriers, *, function, reach):
+    """The picture [H, W, 4], from the listed runs alone."""
+    h, w = stamps.weight.shape
+    runs = -(-w // LANES)
+    stride, side = runs * LANES + 2 * reach, 2 * reach + 1
+    pad = ((reach, reach), (reach, stride - w - reach))
+    flat = lambda plane: jnp.pad(plane, pad).ravel()  # noqa: E731
+    split = lambda planes: None if planes is None else tuple(flat(p) for p in planes)  # noqa: E731
+    radius = None if stamps.radius is None else jnp.pad(stamps.radius, pad, constant_values=1).ravel()
+    planes = Stamps(flat(stamps.weight), radius, split(stamps.color), split(stamps.turn), split(stamps.moved))
+    counted = () if barriers is None else tuple(jnp.pad(c, pad, mode="edge").ravel() for c in crossings(barriers))
+    paper = None if noise is None else flat(noise[..., 0])
+
+    one = jax.tree.map(lambda plane: plane[:1], planes)
+    own_rgb = jax.eval_shape(lambda p: imprint(p, 0.0, 0.0, brush, image, function), one)[1] is not None
+    channels = 1 if stamps.color is None and not own_rgb else 4
+    always = unknown_truth(stamps.weight)
+
+    def group(k, canvas, *, cut):
+        run = lax.dynamic_slice_in_dim(listed, k * GROUP, GROUP)
+        start = run // runs * stride + run % runs * LANES  # the top left corner of the window around the run
+        centre = start + reach * stride
+
+        def row(i, total):
+            window = jax.tree.map(lambda plane: _read_runs(plane, start + i * stride, LANES + 2 * reach), planes)
+            places = [
+                _read_runs(c, at, LANES + 2 * reach) for at in (start + i * stride, centre) for c in counted * cut
+            ]
+            y = (i - reach).astype(stamps.weight.dtype)  # the pixel is that much higher than the stamp
+            left = partial(_row_of_stamps, y=y, reach=reach, brush=brush, image=image, function=function)
+            if channels == 1:
+                return [total[0] + sum(alpha for alpha, _ in left(window, places))]
+            # every channel would compute the opacity again
+            known = None if own_rgb else stored(always, lambda *a: jnp.stack([p[0] for p in left(*a)]), window, places)
+            for j, (alpha, rgb) in enumerate(left(window, places)):
+                alpha = alpha if known is None else known[j]
+                stamp = jax.tree.map(lambda plane, j=j: plane[:, j : j + LANES], window)
+                total = [t + alpha * c for t, c in zip(total, (*tinted(stamp, rgb, brush), 1), strict=True)]
+            return total
+
+        total = lax.fori_loop(0, side, row, [jnp.zeros((GROUP, LANES), stamps.weight.dtype)] * channels)
+        sheet = None if paper is None else _read_runs(paper, centre + reach, LANES)
+        picture = _compress(total, brush, sheet)
+        return canvas.at[run].set(jnp.stack(picture, axis=-1).reshape(GROUP, LANES * 4), mode="promise_in_bounds")
+
+    canvas = jnp.zeros((h * runs, LANES * 4), stamps.weight.dtype)
+    canvas = lax.fori_loop(0, counts[0], partial(group, cut=False), canvas)
+    if barriers is not None:
+        canvas = lax.fori_loop(counts[0], counts[0] + counts[1], partial(group, cut=True), canvas)
+    return canvas.reshape(h, runs * LANES, 4)[:, :w]
+
+
+def _row_of_stamps(window, places, *, y, reach, brush, image, function):
+    """[(alpha, rgb)] that the stamps of one row of a window leave, from the leftmost to the rightmost."""
+    found = []
+    for j in range(2 * reach + 1):
+        here, middle = slice(j, j + LANES), slice(reach, reach + LANES)
+        stamp = jax.tree.map(lambda plane, here=here: plane[:, here], window)
+        if places:
+            of_stamp, of_pixel = places[:2], places[2:]
+            corners = (of_stamp, here), (of_pixel, middle), (of_stamp, middle), (of_pixel, here)
+            free = _free(*([count[:, part] for count in counts] for counts, part in corners))
+            stamp = stamp._replace(weight=jnp.where(free, stamp.weight, 0))
+        found.append(imprint(stamp, jnp.asarray(reach - j, y.dtype), y, brush, image, function))
+    return found
+
+
+def _read_runs(flat, start, width: int):
+    """[runs, width] windows of flat [n]."""
+    numbers = lax.GatherDimensionNumbers(offset_dims=(1,), collapsed_slice_dims=(), start_index_map=(0,))
+    mode = lax.GatherScatterMode.PROMISE_IN_BOUNDS
+    return lax.gather(flat, start[:, None], numbers, (width,), mode=mode)
+
+
+@partial(jax.jit, static_argnames=("function", "reach"))
+def draw_everywhere(profile, field, brush, shading, noise, image, barriers, *, function, reach):
+    """All pixels stamp, one offset of the footprint after another: has a gradient, but costs area times footprint."""
+    stamps = stamps_planes(profile, field, brush, shading, noise, colored=True, turned=True, moved=True, grown=True)
+    h, w = stamps.weight.shape
+    side, dtype = 2 * reach + 1, stamps.weight.dtype
+    counted = None if barriers is None else crossings(barriers)
+
+    def seen(count, row, col):
+        """Counts, as seen from the stamps, at this place of their windows."""
+        return lax.dynamic_slice(jnp.pad(count, reach, mode="edge"), (row, col), (h, w))
+
+    @jax.checkpoint
+    def add(canvas, k):
+        row, col = k // side, k % side
+        x, y = (col - reach).astype(dtype), (reach - row).astype(dtype)
+        stamp = stamps
+        if counted is not None:
+            middle = jnp.full_like(row, reach)
+            pixel, row_of_stamp, row_of_pixel = (
+                [seen(c, *place) for c in counted] for place in ((row, col), (middle, col), (row, middle))
+            )
+            stamp = stamps._replace(
+                weight=jnp.where(_free(counted, pixel, row_of_stamp, row_of_pixel), stamps.weight, 0)
+            )
+        alpha, rgb = imprint(stamp, x, y, brush, image, function)
+        planes = jnp.stack([alpha * c for c in (*tinted(stamp, rgb, brush), 1)])
+        here = lax.dynamic_slice(canvas, (jnp.zeros_like(row), row, col), (4, h, w))
+        return lax.dynamic_update_slice(canvas, here + planes, (jnp.zeros_like(row), row, col)), None
+
+    canvas = jnp.zeros((4, h + 2 * reach, w + 2 * reach), dtype)
+    canvas, _ = lax.scan(add, canvas, jnp.arange(side * side, dtype=jnp.int32))
+    total = list(canvas[:, reach : reach + h, reach : reach + w])
+    return jnp.stack(_compress(total, brush, None if noise is None else noise[..., 0]), axis=-1)
+
+
+def _compress(total, brush, paper):
+    """Paper, then all four channels by one factor, so that alpha = 1 - exp(-I_a) and colours stay."""
+    depth = total[-1] if paper is None else total[-1] * (1 - brush.paper * paper)
+    small = depth < 1e-4
+    factor = jnp.where(small, 1 - 0.5 * depth, -jnp.expm1(-depth) / jnp.where(small, 1, depth))
+    if paper is not None:
+        factor = factor * (1 - brush.paper * paper)
+    rgb = total[:3] if len(total) == 4 else [total[0] * brush.color[i] for i in range(3)]
+    return [plane * factor for plane in (*rgb, total[-1])]

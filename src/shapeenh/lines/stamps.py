@@ -1,0 +1,130 @@
+"""Stamps: how heavy, where, how large, how turned, in which colour (eqs. 8.2 and 8.3 of TH10), and their footprints."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from shapeenh.lines.profile import _read
+from shapeenh.numerics import safe_divide, safe_hypot, safe_sqrt, smoothstep
+
+FOOTPRINTS = ("disc", "ellipse")
+_CUT = 1e-3  # taken off all weights, so that stamps fainter than this are none
+
+
+class Stamps(NamedTuple):
+    """One stamp per pixel, as planes [..., H, W]; None for what is the same everywhere.
+
+    weight: 0 where there is no stamp. radius: px, or None for the brush's. color: [3], or None for the brush's.
+    turn: [2], the first row of T_x without its scale; or None. moved: [2], px, the stamp's shift; or None.
+    """
+
+    weight: jax.Array
+    radius: jax.Array | None
+    color: Any
+    turn: Any
+    moved: Any
+
+
+# ------------------------------------------------------------------------------------------- weights (8.2), T_x (8.3)
+
+
+def stamps_planes(profile, field, brush, shading, noise, *, colored, turned, moved, grown) -> Stamps:
+    """The stamps of all pixels; the flags say which planes are wanted."""
+    height, distance = profile.height, profile.distance
+    rise = smoothstep(brush.low, brush.high, height)
+    profile_width = safe_sqrt(safe_divide(jnp.maximum(height, 0), -profile.curvature))
+    s = jnp.minimum(brush.width + brush.spread * profile_width, 64)
+    bell = jnp.maximum(rise * jnp.exp(-0.5 * (distance / s) ** 2) - _CUT, 0)  # lambda exp(-d^2 / 2 s^2)
+    radius = brush.radius * (1 - brush.grow + brush.grow * rise)
+    usable = profile.valid & (radius > 1e-3)
+    radius = jnp.where(usable, radius, 1)
+
+    # What a straight line of such stamps adds up to: its length times its width, or the footprint, if that is smaller.
+    line, whole = 2 * radius * np.sqrt(2 * np.pi).item() * s, np.pi * radius * radius * brush.aspect
+    total = line * whole / safe_hypot(line, whole)
+    weight = brush.flow * bell / total
+    if noise is not None:
+        weight = weight * (1 - smoothstep(0.3, 0.7, brush.gaps * noise[..., 1]))
+    weight = jnp.where(usable, weight, 0)
+
+    theta_x, theta_y = field.direction[..., 0], field.direction[..., 1]
+    color = shift = None
+    if colored:
+        color = jnp.broadcast_to(brush.color[:, None, None], (3, *height.shape))
+        if shading is not None:
+            color = color + brush.shade * (_at_skeleton(shading, distance, theta_x, theta_y) - color)
+        if noise is not None:
+            tint = brush.tint * (noise[..., 2] - 0.5)
+            color = jnp.maximum(color * (1 + 2 * tint)[None] + jnp.maximum(tint, 0)[None] * 0.2, 0)
+    if moved and noise is not None:
+        wobble = 2 * brush.wobble * (noise[..., 3] - 0.5)
+        shift = jnp.stack([wobble * theta_x, wobble * theta_y])
+    turn = jnp.stack([-theta_y, theta_x]) if turned else None
+    return Stamps(weight, radius if grown else None, color, turn, shift)
+
+
+stamps_of = partial(jax.jit, static_argnames=("colored", "turned", "moved", "grown"))(stamps_planes)
+
+
+def _at_skeleton(shading, distance, theta_x, theta_y):
+    """The shading where the skeleton is, `[3, H, W]`."""
+    h, w = distance.shape
+    row = lax.broadcasted_iota(jnp.int32, (h, w), 0).astype(distance.dtype)
+    col = lax.broadcasted_iota(jnp.int32, (h, w), 1).astype(distance.dtype)
+    row, col = row - distance * theta_y, col + distance * theta_x
+    padded = jnp.pad(jnp.where(jnp.isfinite(shading), shading, 0), ((1, 1), (1, 1), (0, 0)), mode="edge")
+    return jnp.stack([_read(padded[..., i], row, col) for i in range(3)])
+
+
+# ------------------------------------------------------------------------------------------- footprints f
+
+
+def imprint(stamp: Stamps, x, y, brush, image, function):
+    """What stamps leave at the offset (x, y) px from them, y up: (alpha, the footprint's own colour or None).
+
+    stamp: planes of any shape, with colours and vectors as tuples of planes.
+    """
+    radius = brush.radius if stamp.radius is None else stamp.radius
+    if stamp.moved is not None:
+        x, y = x - stamp.moved[0], y - stamp.moved[1]
+    if function == "disc":
+        return stamp.weight * jnp.clip(radius - _length(x, y) + 0.5, 0, 1), None
+    assert stamp.turn is not None
+    cos, sin = stamp.turn[0], stamp.turn[1]
+    along, across = cos * x + sin * y, cos * y - sin * x
+    if function == "ellipse":
+        short = radius * brush.aspect  # (1 - |(u, v / aspect)|) times the short half axis
+        return stamp.weight * jnp.clip(short - _length(brush.aspect * along, across) + 0.5, 0, 1), None
+    u, v = along / radius, across / radius
+    inside = (jnp.abs(u) <= 1) & (jnp.abs(v) <= 1)
+    u, v = jnp.where(inside, u, 0), jnp.where(inside, v, 0)
+    rgba = _sample(image, u, v) if function == "image" else function(u, v)
+    rgb = [rgba[..., i] for i in range(3)] if rgba.ndim > u.ndim else None
+    return stamp.weight * jnp.where(inside, rgba if rgb is None else rgba[..., 3], 0), rgb
+
+
+def _length(x, y):
+    """Of moderate numbers; its gradient at 0 is 0. (`safe_hypot` would be most of the work.)"""
+    return jnp.sqrt(x * x + y * y + 1e-30)
+
+
+def tinted(stamp: Stamps, rgb, brush):
+    """The three factors that make a stamp's alpha its premultiplied colour."""
+    base = brush.color if stamp.color is None else stamp.color
+    return [base[i] * (1 if rgb is None else rgb[i]) for i in range(3)]
+
+
+def _sample(image, u, v):
+    """Bilinear RGBA at u (along the columns), v (up) in [-1, 1]; colours are weighted by their opacity."""
+    h, w = image.shape[:2]
+    row, col = 0.5 * (1 - v) * h - 0.5, 0.5 * (1 + u) * w - 0.5
+    alpha = image[..., 3]
+    planes = [jnp.pad(p, 1, mode="edge") for p in (*(image[..., i] * alpha for i in range(3)), alpha)]
+    red, green, blue, a = (_read(p, row, col) for p in planes)
+    return jnp.stack([*(safe_divide(c, a) for c in (red, green, blue)), a], axis=-1)
