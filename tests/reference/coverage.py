@@ -1,7 +1,7 @@
 """Subpixel reconstruction antialiasing by brute force (Chajdas et al. 2011), in float64. NumPy only.
 
 Every sample of every pixel is compared with each of the 3 x 3 pixels around: no list, no shortcut, but for the rule
-that a pixel whose samples are all covered and whose 8 neighbours show its own surface keeps its own shading.
+that a pixel inside of the image whose 8 neighbours show its own surface keeps its own shading.
 """
 
 import numpy as np
@@ -58,13 +58,14 @@ def scores(mesh, camera, mask, position, normal, fine, samples):
     mask, position, normal = (np.asarray(a) for a in (mask, position, normal))
     projection = np.asarray(camera.projection, np.float64)
     at, turned = surface(mesh, camera, fine)
-    keeps = mask & (fine.reshape(height, samples, width, samples) >= 0).all((1, 3))
+    keeps = mask.copy()
     result = np.full((height, width, samples * samples, 9), 9.0)
     for y in range(height):
         for x in range(width):
             for k in range(9):
                 v, u = y + k // 3 - 1, x + k % 3 - 1
                 if not (0 <= v < height and 0 <= u < width):
+                    keeps[y, x] = False
                     continue
                 if not mask[v, u]:
                     keeps[y, x] = False

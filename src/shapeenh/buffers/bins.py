@@ -23,9 +23,24 @@ BLOCK = 16 * 32 * LANES  # faces per step: what is computed on the way stays in 
 LONG = 1 << 14  # beyond this extent (64 px) int32 areas could overflow: decided later, in 64 bits
 
 
-def classify(x, y, height, width, cull):
-    """Class [F] uint8 of faces with snapped corners x, y [3, F]."""
-    x0, x1, y0, y1 = pixel_box(x, y, height, width)
+def touches(box, cells, side, height, width):
+    """Whether pixel boxes x0, x1, y0, y1 [F] meet a cell, of side x side pixels, that is wanted. Cells are given as
+    their summed-area table [rows + 1, columns + 1], so that four reads count those in a rectangle."""
+    columns = cells.shape[1]
+
+    def cell(at, size):
+        return lax.div(jnp.clip(at, 0, size - 1), np.int32(side))
+
+    left, right = cell(box[0], width), cell(box[1], width) + 1
+    top, bottom = cell(box[2], height) * columns, (cell(box[3], height) + 1) * columns
+    table = cells.reshape(-1)
+    inside = take(table, bottom + right) - take(table, bottom + left) - take(table, top + right)
+    return inside + take(table, top + left) > 0
+
+
+def classify(x, y, height, width, cull, cells=None, side=1):
+    """Class [F] uint8 of faces with snapped corners x, y [3, F]; with `cells`, only of those that touch one."""
+    x0, x1, y0, y1 = box = pixel_box(x, y, height, width)
     columns, rows = x1 - x0 + 1, y1 - y0 + 1
     kind = jnp.full(columns.shape, LARGE, jnp.int32)
     for k in reversed(range(len(WINDOWS))):
@@ -35,6 +50,8 @@ def classify(x, y, height, width, cull):
     drawn = jnp.where(faces_viewer(double_area(x, y), cull), kind, 0)
     kind = jnp.where(extent >= LONG, LARGE, drawn)
     kind = jnp.where((columns > 0) & (rows > 0), kind, 0)
+    if cells is not None:
+        kind = jnp.where(touches(box, cells, side, height, width), kind, 0)
     cut = jnp.where(low_x == BEHIND, 0, LARGE)
     return jnp.where(high_x == BEHIND, cut, kind).astype(jnp.uint8)
 
@@ -49,7 +66,7 @@ def class_words(kind):
     return words.reshape(LARGE, -1)
 
 
-def bin_faces(always, faces, corners, height, width, cull):
+def bin_faces(always, faces, corners, height, width, cull, cells=None, side=1):
     """Bit words [LARGE, n] and the inclusive counts of their bits, of faces [F, 3] and corners [3, V].
 
     The last block is moved back so that it ends with the last face; what it shares with the one before counts there.
@@ -72,7 +89,7 @@ def bin_faces(always, faces, corners, height, width, cull):
         def kinds(xy):
             face = start + lax.iota(jnp.int32, size)
             new = (face >= i * size) & (face < count)
-            return jnp.where(new, classify(xy[0], xy[1], height, width, cull), jnp.uint8(0))
+            return jnp.where(new, classify(xy[0], xy[1], height, width, cull, cells, side), jnp.uint8(0))
 
         new = stored(always, class_words, stored(always, kinds, xy))
         return lax.dynamic_update_slice(words, new, (jnp.int32(0), i * (size // 32)))

@@ -1,8 +1,9 @@
 """Smooth outlines at the cost of one shading per pixel: subpixel reconstruction antialiasing.
 
 Chajdas, McGuire and Luebke 2011 (I3D): visibility is cheap, shading is dear, so visibility is sampled S x S times per
-pixel and every sample borrows the shading of the pixel, among the 3 x 3 around it, that shows the same surface. Almost
-all pixels show one surface and keep their own shading; only the others, the *mixed* ones, are listed and looked at.
+pixel and every sample borrows the shading of the pixel, among the 3 x 3 around it, that shows the same surface.
+Where the centres of all 3 x 3 pixels show one surface, or all of them nothing, that is what the samples see as well.
+The other pixels, the *mixed* ones, are few: only they are listed, and only faces near them are drawn again.
 
 When are a sample and a pixel on the same surface? When each lies in the other's tangent plane and their normals agree:
 the distance from a plane is measured in pixels' footprints at that depth, the difference of normals as the length of
@@ -21,11 +22,11 @@ from jax import lax
 
 from shapeenh import checks
 from shapeenh.buffers.gbuffer import surface
-from shapeenh.buffers.inputs import check_table
+from shapeenh.buffers.inputs import check_camera, check_mesh, check_table
 from shapeenh.buffers.project import clip_matrix
 from shapeenh.buffers.resolve import barycentrics, blend
 from shapeenh.buffers.runs import listed, table_rows
-from shapeenh.buffers.visibility import rasterize
+from shapeenh.buffers.visibility import CULL, check_cull, visible_triangles
 from shapeenh.buffers.xla import take
 from shapeenh.fusion import stored, unknown_truth
 from shapeenh.types import Camera, Coverage, GBuffer, Mesh
@@ -36,6 +37,7 @@ OWN = 4  # the pixel itself in its 3 x 3 neighbourhood, which is counted in read
 ORDER = (4, 1, 3, 5, 7, 0, 2, 6, 8)  # from near to far, so that the nearer of two equally good ones is taken
 NEARER = 1e-3  # weight of a squared distance on screen: decides between pixels of the same surface
 CHUNK = 1024  # mixed pixels per step
+CELL = 4  # pixels: faces are drawn for the samples where a cell of this side holds a mixed pixel
 
 # ------------------------------------------------------------------------------------------- from samples to pixels
 
@@ -47,13 +49,13 @@ def sample_coverage(
 
     Source: Chajdas, McGuire and Luebke 2011 (subpixel reconstruction antialiasing). A sample takes the nearest of the
     3 x 3 pixels that show its surface; where none does (a wire that no pixel centre meets) the best of those that show
-    anything, its own for choice; where all nine show nothing it counts as background, so that a wire thinner than a
-    pixel is broken, as it is without samples.
+    anything, its own for choice. What none of the nine pixels shows is not there: a wire or a hole thinner than a pixel
+    is broken where it passes between the centres, as it is without samples.
 
     mesh, camera: what `gbuffer` was made from; the size is the G-buffer's.
     *Static*: samples: per pixel and axis, 1 to 8; 1 tells the mask. cull: as in `rasterize`.
-    Returns a `Coverage` for `resolve_coverage`. The visibility of the samples is computed at S times the resolution,
-    what remains costs by the number of mixed pixels.
+    Returns a `Coverage` for `resolve_coverage`. Faces near outlines and creases are drawn at S times the resolution,
+    which takes 12 bytes per sample for the while; all else costs by the number of mixed pixels.
     *Gradient*: none; coverage is a constant of the derivative, as visibility is.
     *Errors*: ValueError as in `rasterize` and `render_gbuffer`, and where S times the size exceeds 32768.
 
@@ -68,35 +70,35 @@ def sample_coverage(
         return Coverage(source=jnp.where(mask, OWN, -1)[..., None].astype(jnp.int8), fraction=mask.astype(jnp.float32))
     if max(height, width) * samples > 1 << 15:
         raise ValueError(f"samples is {samples} for {height} x {width} pixels; accepted are at most 32768 per axis")
-    seen = rasterize(mesh, camera, height=height * samples, width=width * samples, cull=cull)
+    check_cull(cull)
+    check_mesh(mesh)
+    check_camera(camera)
     check_table("mesh.normals", mesh.normals, mesh, 3)
     dtype = checks.float_dtype(mesh.vertices, mesh.normals, camera.view, camera.projection)
     given = (mesh.vertices, mesh.normals, camera.view, camera.projection, gbuffer.position, gbuffer.normal)
     arrays = [lax.stop_gradient(jnp.asarray(a, dtype)) for a in given]
-    source, fraction = sources(*arrays, jnp.asarray(mesh.faces, jnp.int32), gbuffer.mask, seen.triangle, samples)
+    source, fraction = sources(*arrays, jnp.asarray(mesh.faces, jnp.int32), gbuffer.mask, samples, CULL[cull])
     return Coverage(source=source, fraction=fraction)
 
 
-@functools.partial(jax.jit, static_argnums=(9,))
-def sources(vertices, normals, view, projection, position, normal, faces, mask, triangle, samples):
+@functools.partial(jax.jit, static_argnums=(8, 9))
+def sources(vertices, normals, view, projection, position, normal, faces, mask, samples, cull):
     """The jitted body of `sample_coverage`, of checked arrays."""
     height, width = mask.shape
-    blocks = triangle.reshape(height, samples, width, samples)
-    some = jnp.max(blocks, axis=(1, 3)) >= 0
     if faces.shape[0] == 0 or vertices.shape[0] == 0:
         nothing = jnp.full((height, width, samples * samples), -1, jnp.int8)
         return nothing, jnp.zeros((height, width), jnp.float32)
 
     @jax.custom_batching.sequential_vmap
-    def one_view(vertices, normals, view, projection, position, normal, faces, mask, triangle, some, whole):
-        always = unknown_truth(vertices, view, faces, triangle)
-        smooth = whole & mask & ~torn(always, position, normal, mask, pixel_size(projection, height, width))
+    def one_view(vertices, normals, view, projection, position, normal, faces, mask):
+        always = unknown_truth(vertices, view, faces, mask)
+        mixed = torn(always, position, normal, mask, pixel_size(projection, height, width))
+        fine = {"height": height * samples, "width": width * samples, "side": CELL * samples}
+        triangle = visible_triangles(vertices, faces, view, projection, wanted_cells(mixed), cull=cull, **fine)
         m, _ = clip_matrix(view, projection)
-        tables = vertices, normals, view, projection, m, position, normal, faces, mask, triangle
-        return mixed_pixels(always, tables, some, smooth, samples)
+        return borrowed(always, vertices, normals, view, projection, m, position, normal, faces, mask, triangle, mixed)
 
-    whole = jnp.min(blocks, axis=(1, 3)) >= 0
-    return one_view(vertices, normals, view, projection, position, normal, faces, mask, triangle, some, whole)
+    return one_view(vertices, normals, view, projection, position, normal, faces, mask)
 
 
 def pixel_size(projection, height, width):
@@ -138,7 +140,7 @@ STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows down, columns right: every pai
 
 
 def torn(always, position, normal, mask, pixel):
-    """[H, W] bool: pixels with a neighbour, out of 8, that shows nothing or another surface."""
+    """[H, W] bool: pixels of whose 3 x 3 not all show one surface, nor all nothing."""
     height, width = mask.shape
 
     def ends(dy, dx):
@@ -159,12 +161,15 @@ def torn(always, position, normal, mask, pixel):
                 off = jnp.maximum(plane_distance(p, q, n), plane_distance(p, q, m))
                 near = off <= PLANE[0] * footprint(jnp.maximum(p[2], q[2]), pixel)
                 alike = sum((n[c] - m[c]) ** 2 for c in range(3)) <= NORMAL[0] ** 2
-                broken = ~(near & alike & mask[here] & mask[there])
+                both, none = mask[here] & mask[there], ~(mask[here] | mask[there])
+                broken = ~((near & alike & both) | none)
                 word = word | pad(jnp.where(broken, jnp.uint8(1 << k), jnp.uint8(0)), here)
         return word
 
     word = stored(always, links, position, normal, mask)
-    out = word > 0
+    edge = np.ones((height, width), bool)
+    edge[1:-1, 1:-1] = False
+    out = (word > 0) | (mask & edge)  # nobody knows what is behind the edge of the image
     for k, step in enumerate(STEPS):
         if step[0] < height and abs(step[1]) < width:
             here, there = ends(*step)
@@ -172,16 +177,25 @@ def torn(always, position, normal, mask, pixel):
     return out
 
 
+def wanted_cells(mixed):
+    """Summed-area table of the cells of CELL x CELL pixels that hold a mixed pixel."""
+    height, width = mixed.shape
+    padded = jnp.pad(mixed, ((0, -height % CELL), (0, -width % CELL)))
+    rows, columns = padded.shape[0] // CELL, padded.shape[1] // CELL
+    cells = jnp.any(padded.reshape(rows, CELL, columns, CELL), axis=(1, 3)).astype(jnp.int32)
+    return jnp.pad(jnp.cumsum(jnp.cumsum(cells, axis=0), axis=1), ((1, 0), (1, 0)))
+
+
 # ------------------------------------------------------------------------------------------- and what they see
 
 
-def mixed_pixels(always, tables, some, smooth, samples):
+def borrowed(always, vertices, normals, view, projection, m, position, normal, faces, mask, triangle, mixed):
     """source [H, W, S * S] int8 and fraction [H, W]."""
-    vertices, normals, view, projection, m, position, normal, faces, mask, triangle = tables
     height, width = mask.shape
+    samples = triangle.shape[0] // height
     count = height * width
     chunk = min(CHUNK, -(-count // 64) * 64)
-    pixels, total = listed((some & ~smooth).reshape(-1), chunk)
+    pixels, total = listed(mixed.reshape(-1), chunk)
     pixel = pixel_size(projection, height, width)
     flat_ids, flat_faces = triangle.reshape(-1), faces.reshape(-1)
     flat_position, flat_normal, flat_mask = position.reshape(-1), normal.reshape(-1), mask.reshape(-1)
@@ -251,7 +265,7 @@ def mixed_pixels(always, tables, some, smooth, samples):
         at = {"mode": "drop", "unique_indices": False}
         return i + 1, source.at[pixel].set(chosen.T, **at), fraction.at[pixel].set(share, **at)
 
-    plain = jnp.where(some, jnp.int8(OWN), jnp.int8(-1)).reshape(-1, 1)
-    state = jnp.int32(0), jnp.broadcast_to(plain, (count, square)), some.reshape(-1).astype(jnp.float32)
+    plain = jnp.where(mask, jnp.int8(OWN), jnp.int8(-1)).reshape(-1, 1)
+    state = jnp.int32(0), jnp.broadcast_to(plain, (count, square)), flat_mask.astype(jnp.float32)
     _, source, fraction = lax.while_loop(lambda state: state[0] * chunk < total, step, state)
     return source.reshape(height, width, square), fraction.reshape(height, width)

@@ -59,8 +59,7 @@ def rasterize(mesh: Mesh, camera: Camera, *, height: int, width: int, cull: bool
     checks.check_type("mesh", mesh, Mesh)
     checks.check_type("camera", camera, Camera)
     height, width = checks.check_size("height", height), checks.check_size("width", width)
-    if not isinstance(cull, bool | str) or cull not in CULL:
-        raise ValueError(f"cull is {cull!r}; accepted are False, True, 'none', 'back', 'front'")
+    check_cull(cull)
     check_mesh(mesh)
     check_camera(camera)
     dtype = checks.float_dtype(mesh.vertices, camera.view, camera.projection)
@@ -70,29 +69,38 @@ def rasterize(mesh: Mesh, camera: Camera, *, height: int, width: int, cull: bool
     return Visibility(triangle=triangle)
 
 
-@functools.partial(jax.jit, static_argnames=("height", "width", "cull"))
-def visible_triangles(vertices, faces, view, projection, *, height, width, cull):
-    """The jitted body of `rasterize`, of checked arrays."""
+def check_cull(cull) -> None:
+    if not isinstance(cull, bool | str) or cull not in CULL:
+        raise ValueError(f"cull is {cull!r}; accepted are False, True, 'none', 'back', 'front'")
+
+
+@functools.partial(jax.jit, static_argnames=("height", "width", "cull", "side"))
+def visible_triangles(vertices, faces, view, projection, cells=None, *, height, width, cull, side=1):
+    """The jitted body of `rasterize`, of checked arrays.
+
+    With `cells`, a summed-area table of wanted cells of side x side pixels (`bins.touches`), only wanted cells are
+    whole: faces that touch none are left out.
+    """
     if faces.shape[0] == 0 or vertices.shape[0] == 0:
         return jnp.full((height, width), -1, jnp.int32)
 
     @jax.custom_batching.sequential_vmap  # a batched loop would drag every view along until the last one is done
-    def one_view(vertices, faces, view, projection):
+    def one_view(vertices, faces, view, projection, cells):
         m, near = clip_matrix(view, projection)
-        return draw(vertices, faces, m, near, height, width, cull)
+        return draw(vertices, faces, m, near, height, width, cull, cells, side)
 
     vertices, view, projection = jax.tree.map(lax.stop_gradient, (vertices, view, projection))
-    return one_view(vertices, faces, view, projection)
+    return one_view(vertices, faces, view, projection, cells)
 
 
-def draw(vertices, faces, m, near, height, width, cull):
+def draw(vertices, faces, m, near, height, width, cull, cells, side):
     """triangle [height, width]: the whole rasteriser, for at least one face."""
     count = faces.shape[0]
     always = unknown_truth(vertices, m, faces)
     with jax.enable_x64(True):  # 64-bit keys, whatever the caller's precision
         corners = stored(always, lambda v, m, near: project(v, m, near, height, width), vertices, m, near)
         shift = nearness_shift(corners)
-        words, ends = bin_faces(always, faces, corners, height, width, cull)
+        words, ends = bin_faces(always, faces, corners, height, width, cull, cells, side)
         totals = ends[:, -1]
         flat_words, flat_ends, flat_corners, flat_faces = (t.reshape(-1) for t in (words, ends, corners, faces))
 
