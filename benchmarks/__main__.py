@@ -1,8 +1,9 @@
 """All benchmarks, one after the other: `python -m benchmarks [NAME ...] [--list]`.
 
 Each writes `results/NAME.json` with the machine, the versions, compile and run apart, and, where its question is one of
-time against error, the plot `results/NAME.png` with the default ringed; `results/README.md` has all answers. Real meshes
-and maps are used where SHAPEENH_DATA names a folder that has them. Nothing else should run on the machine meanwhile.
+time against error, the plot `results/NAME.png` with the default ringed; `results/README.md` has all answers. Real
+meshes and maps are used where SHAPEENH_DATA names a folder that has them. Nothing else should run on the machine
+meanwhile.
 """
 
 from __future__ import annotations
