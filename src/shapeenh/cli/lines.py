@@ -115,14 +115,18 @@ def _run_object(arguments) -> None:
     if arguments.over == "paper":
         below = jnp.broadcast_to(jnp.asarray(PAPER, strokes.dtype), (*strokes.shape[:2], 3))
     elif arguments.over == "shading":
-        fine, samples = gbuffer, loaded.samples
-        if samples > 1:
-            fine = loaded.gbuffer(samples)
-            radiance = shade(fine, loaded.lights, loaded.material)
-        coverage = loaded.coverage and clock.stage("coverage", lambda: loaded.coverage(gbuffer))
-        shown = render.side_by_side([radiance], exposure, fine.mask, arguments, samples, coverage=coverage)
-        below = jnp.asarray(shown)
+        below = jnp.asarray(_shaded(arguments, loaded, gbuffer, radiance, exposure))
     clock.once("save", lambda: io.save_image(arguments.output, _over(strokes, below)))
+
+
+def _shaded(arguments, loaded, gbuffer, radiance, exposure) -> np.ndarray:
+    """The shaded object over paper, with smooth outlines, as `shapeenh render` shows it."""
+    samples = loaded.samples
+    coverage = loaded.coverage and loaded.coverage(gbuffer)
+    if samples > 1:
+        gbuffer = loaded.gbuffer(samples)
+        radiance = shade(gbuffer, loaded.lights, loaded.material)
+    return render.side_by_side([radiance], exposure, gbuffer.mask, arguments, samples, coverage=coverage)
 
 
 def object_lines(gbuffer, descriptor, picture, camera, arguments, kinds):
@@ -140,8 +144,10 @@ def object_lines(gbuffer, descriptor, picture, camera, arguments, kinds):
         field = line_field(kind, gbuffer, descriptor, luminance=image, sigma=1.0)
         brush = _brush(arguments, kind, height)
         profile = fit_profile(field, radius=3.0 if kind == "occlusion" else 4.0, least=float(brush.low))
-        footprint = style_footprint(arguments.style)
-        layer = draw_lines(profile, field, brush, footprint=footprint, shading=picture, noise=noise)
+        inputs = {"footprint": style_footprint(arguments.style), "shading": picture, "noise": noise}
+        if kind != "occlusion":  # those lie on the silhouettes, all others end there
+            inputs |= {"gbuffer": gbuffer, "descriptor": descriptor}
+        layer = draw_lines(profile, field, brush, **inputs)
         strokes = layer + (1 - layer[..., 3:]) * strokes
     return strokes
 
