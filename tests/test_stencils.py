@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jax.test_util import check_grads
 
 from shapeenh.fusion import stored, unknown_truth
 from shapeenh.stencils import derivatives, links, pair_mean
 
-_derivatives = jax.jit(lambda u, c: derivatives(u, *links(c), unknown_truth(u)))
+_derivatives = jax.jit(lambda u, c: [jnp.stack(d) for d in derivatives(u, *links(c), unknown_truth(u))])
 
 
 def disc(h, w, radius):
@@ -64,6 +65,20 @@ def test_turning_the_image_turns_the_derivative(x64, rng):
     t_x, t_y = _derivatives(jnp.asarray(turn(u)), jnp.asarray(turn(c)))
     np.testing.assert_allclose(t_x, -turn(d_y), atol=1e-12)
     np.testing.assert_allclose(t_y, turn(d_x), atol=1e-12)
+
+
+def test_reverse_mode_is_the_transpose(x64, rng):
+    """With respect to planes and links, at a run of closed links too; and the same when only one is asked for."""
+    u, c = jnp.asarray(rng.standard_normal((2, 5, 7))), 0.3 + 0.7 * rng.random((5, 7))
+    link_x, link_y = links(jnp.asarray(c))
+    run = lambda u, x, y: derivatives(u, x, y, unknown_truth(u))  # noqa: E731
+    check_grads(run, (u, link_x, link_y), order=1, modes=["rev"], eps=1e-6)
+    closed = jnp.asarray(link_x).at[2].set(0)
+    loss = lambda u, x, y: sum(jnp.vdot(w, d) for w, d in zip(weights, sum(run(u, x, y), ()), strict=True))  # noqa: E731
+    weights = jnp.asarray(rng.standard_normal((4, 5, 7)))
+    whole, alone = jax.grad(loss, (0, 1))(u, closed, link_y), jax.grad(loss)(u, closed, link_y)
+    np.testing.assert_allclose(whole[0], alone, atol=1e-12)
+    check_grads(lambda u: run(u, closed, link_y), (u,), order=1, modes=["rev"])
 
 
 @settings(max_examples=8, deadline=None)

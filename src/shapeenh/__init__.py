@@ -13,7 +13,8 @@ from shapeenh.buffers.sources import gbuffer_from_height, gbuffer_from_normals
 from shapeenh.buffers.textures import apply_texture, sample_texture
 from shapeenh.buffers.visibility import rasterize
 from shapeenh.descriptor.apparent import describe_apparent, describe_object
-from shapeenh.descriptor.display import curvature_colors
+from shapeenh.descriptor.convolution import line_integral_convolution
+from shapeenh.descriptor.display import curvature_colors, curvature_legend
 from shapeenh.descriptor.relief import curvature_intensity, describe_relief
 from shapeenh.descriptor.view import (
     describe,
@@ -91,6 +92,7 @@ __all__ = [
     "contrast",
     "curvature_colors",
     "curvature_intensity",
+    "curvature_legend",
     "curvature_mapping",
     "decode_normals",
     "describe",
@@ -113,6 +115,7 @@ __all__ = [
     "harmonic_radiance",
     "interpolate",
     "line_field",
+    "line_integral_convolution",
     "lit_sphere",
     "load_environment",
     "load_height",

@@ -1,10 +1,11 @@
-"""Pictures of a descriptor (LW09 fig. 6, TH10 fig. 4.7)."""
+"""Pictures of a descriptor (LW09 fig. 6, TH10 figs 4.3 and 4.7), and their legend."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
-from shapeenh.checks import check_range, check_shape, check_type
+from shapeenh.checks import check_range, check_shape, check_size, check_type
 from shapeenh.descriptor.view import mean_curvature
 from shapeenh.types import Descriptor
 
@@ -29,6 +30,11 @@ def curvature_scale(t):
     return jnp.stack([jnp.interp(t, at, anchors[:, i]) for i in range(3)], axis=-1)
 
 
+def _default_scale(height: int) -> float:
+    """0.1 1/px at a height of 600."""
+    return 60 / height
+
+
 def curvature_colors(descriptor, mask, *, scale=None):
     """The descriptor as in LW09 fig. 6: convex cold, concave warm, by mean curvature; silhouettes and creases black.
 
@@ -41,10 +47,74 @@ def curvature_colors(descriptor, mask, *, scale=None):
     """
     check_type("descriptor", descriptor, Descriptor)
     if scale is None:
-        scale = 60 / descriptor.silhouette.shape[0]
+        scale = _default_scale(descriptor.silhouette.shape[0])
     check_range("scale", scale, 0, float("inf"), open_ends=True)
     check_shape("mask", mask, descriptor.silhouette.shape)
     h = mean_curvature(descriptor.hessian) / scale
     ink = jnp.maximum(descriptor.silhouette, descriptor.crease)
     colors = curvature_scale(h) * (1 - ink)[..., None]
     return jnp.where(mask[..., None], colors, 1)
+
+
+# ------------------------------------------------------------------------------------------- the legend
+
+_GLYPHS = {  # 3 x 5 pixels, a row per digit in octal
+    "0": "75557",
+    "1": "26227",
+    "2": "71747",
+    "3": "71717",
+    "4": "55711",
+    "5": "74717",
+    "6": "74757",
+    "7": "71122",
+    "8": "75757",
+    "9": "75717",
+    ".": "00002",
+    "-": "00700",
+    "+": "02720",
+    "e": "07746",
+    "/": "11244",
+    "p": "07744",
+    "x": "05225",
+}
+
+
+def curvature_legend(height, *, scale=None) -> np.ndarray:
+    """The colour scale of `curvature_colors` as a strip to stand beside a picture, with ticks in 1/px.
+
+    height: int, px, 64 to 32768: that of the picture. scale: [], 1/px, > 0, as given to `curvature_colors`; None = its
+        default for this height.
+    Returns [height, width, 3] in [0, 1], sRGB encoded, NumPy: concave at the top, convex at the bottom, a label at
+    +scale, +scale/2, 0, -scale/2, -scale, on white; the width grows with the height.
+    Gradient: none. Errors: ValueError for a height or scale out of range.
+
+        sheet = np.concatenate([curvature_colors(descriptor, mask), curvature_legend(mask.shape[0])], axis=1)
+    """
+    height = check_size("height", height, low=64)
+    scale = _default_scale(height) if scale is None else scale
+    check_range("scale", scale, 0, float("inf"), open_ends=True)
+    zoom = max(1, height // 240)
+    top, bar, tick = 8 * zoom, 10 * zoom, 3 * zoom
+    labels = [_text(f"{t * float(scale):+.3g}" if t else "0", zoom) for t in (1, 0.5, 0, -0.5, -1)]
+    unit = _text("1/px", zoom)
+    left = 4 * zoom
+    width = left + bar + tick + 2 * zoom + max(label.shape[1] for label in (*labels, unit)) + 4 * zoom
+    sheet = np.ones((height, width, 3))
+    rows = np.linspace(1, -1, height - 2 * top - 8 * zoom)
+    sheet[top : top + len(rows), left : left + bar] = np.asarray(curvature_scale(jnp.asarray(rows)))[:, None]
+    for i, label in enumerate(labels):
+        middle = top + round(i * (len(rows) - 1) / 4)
+        sheet[middle - zoom // 2 : middle - zoom // 2 + zoom, left + bar : left + bar + tick] = 0
+        _print(sheet, label, middle - label.shape[0] // 2, left + bar + tick + 2 * zoom)
+    _print(sheet, unit, height - unit.shape[0] - 2 * zoom, left)
+    return sheet
+
+
+def _text(text: str, zoom: int) -> np.ndarray:
+    """[5 zoom, 4 zoom per letter] bool."""
+    columns = [np.array([[int(row) >> bit & 1 for bit in (2, 1, 0, 3)] for row in _GLYPHS[letter]]) for letter in text]
+    return np.kron(np.concatenate(columns, axis=1), np.ones((zoom, zoom), int)) > 0
+
+
+def _print(sheet, ink, top: int, left: int) -> None:
+    sheet[top : top + ink.shape[0], left : left + ink.shape[1]][ink] = 0

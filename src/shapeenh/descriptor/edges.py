@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from shapeenh.fusion import stored
 from shapeenh.numerics import norm, safe_divide, smoothstep
-from shapeenh.stencils import shift
+from shapeenh.stencils import WHOLE, shift, window
 
 # A step counts in units of the distance between neighbouring samples on the surface. Shading normals of real meshes are
 # up to 20 degrees off their facets (0.34); 0.6 is a step of 0.6 pixels between two surfaces that face the viewer.
@@ -63,7 +63,7 @@ def footprint(position, depth, good):
 # ------------------------------------------------------------------------------------------- silhouettes
 
 
-def _step(normal, position, size, finite, axis: int):
+def _step(*values):
     """How far two neighbours are from lying on one smooth surface, in sample distances; positive where the first of
     them is in front, negative where the second is.
 
@@ -72,17 +72,27 @@ def _step(normal, position, size, finite, axis: int):
     of the sample distance that the normals predict, size / m_z. Where each sample lies behind the other's tangent plane
     the two planes meet between them: that is a convex surface or edge, however sharp, and no step at all.
     """
-    size_p, size_q = _pairs(size, axis)
-    usable = jnp.logical_and(*_pairs(finite, axis))
-    n_p, n_q = zip(*(_pairs(plane, axis) for plane in normal), strict=True)
-    d = [q - p for p, q in (_pairs(plane, axis) for plane in position)]
+    (*n_p, p_x, p_y, p_z, size_p, on_p), (*n_q, q_x, q_y, q_z, size_q, on_q) = values[0::2], values[1::2]
+    d = q_x - p_x, q_y - p_y, q_z - p_z
     m = [n_p[i] + n_q[i] for i in range(3)]
-    above_p = n_p[0] * d[0] + n_p[1] * d[1] + n_p[2] * d[2]
-    below_q = n_q[0] * d[0] + n_q[1] * d[1] + n_q[2] * d[2]
+    dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]  # noqa: E731
+    above_p, below_q = dot(n_p, d), dot(n_q, d)
     gap = jnp.minimum(jnp.abs(above_p + below_q), 2 * jnp.maximum(0, jnp.maximum(above_p, -below_q)))
-    square = m[0] * m[0] + m[1] * m[1] + m[2] * m[2]
-    gap = safe_divide(gap * jnp.maximum(m[2], 0.02), jnp.minimum(size_p, size_q) * square)
-    return jnp.where(usable, jnp.where(d[2] > 0, -gap, gap), 0)
+    gap = safe_divide(gap * jnp.maximum(m[2], 0.02), jnp.minimum(size_p, size_q) * dot(m, m))
+    return (jnp.where(on_p * on_q > 0, jnp.where(d[2] > 0, -gap, gap), 0),)
+
+
+def _steps(normal, position, size, finite, always):
+    """`_step` from every pixel to its right neighbour, [H, W-1], and to its lower one, [H-1, W]."""
+    planes = (*normal, *position, size, finite.astype(size.dtype))
+    domains = (((0, 0), (0, 1)), (0, 0, 0, -1)), (((0, 0), (1, 0)), (0, -1, 0, 0))
+    return [window(_step, (reads,) * 8, (WHOLE,) * 8, pairs, always, *planes)[0] for reads, pairs in domains]
+
+
+def _far_side(*steps):
+    """The largest of a pixel's four steps that it lies behind: from the pairs right of it, left of it, below, above."""
+    right, left, below, above = steps
+    return (smoothstep(LOW, HIGH, jnp.maximum(jnp.maximum(left, -right), jnp.maximum(above, -below))),)
 
 
 def silhouettes(gbuffer, normal, good, always):
@@ -102,15 +112,12 @@ def silhouettes(gbuffer, normal, good, always):
             finite = finite & jnp.isfinite(plane)
         return [jnp.where(finite, plane, 0) for plane in planes], jnp.where(finite, depth, 1), finite
 
-    def steps(normal, position, size, finite):
-        return _step(normal, position, size, finite, -1), _step(normal, position, size, finite, -2)
-
     position, depth, finite = stored(always, clean, gbuffer.position, gbuffer.depth)
     size = footprint(position, depth, finite)
-    step_x, step_y = stored(always, steps, normal, position, size, finite)
+    step_x, step_y = _steps(normal, position, size, finite, always)
     step_x, step_y = jnp.pad(step_x, ((0, 0), (1, 1))), jnp.pad(step_y, ((1, 1), (0, 0)))
-    largest = jnp.maximum(jnp.maximum(step_x[:, :-1], -step_x[:, 1:]), jnp.maximum(step_y[:-1], -step_y[1:]))
-    weight = smoothstep(LOW, HIGH, largest)
+    reads = ((0, 0), (0, -1)), ((0, 0), (-1, 0))
+    (weight,) = window(_far_side, reads, ((0, 0, 1, 0), (1, 0, 0, 0)), WHOLE, always, step_x, step_y)
     if gbuffer.occlusion is not None:
         open_ = jnp.where(jnp.isfinite(gbuffer.occlusion), gbuffer.occlusion, 1)
         weight = jnp.where(jnp.max(size) > 0, weight, 1 - smoothstep(0.25, 0.75, open_))

@@ -31,7 +31,7 @@ def depth_gradient(normal, foreshortening):
     """
     n_z = jnp.maximum(normal[2], LEAST_NZ)
     power = 1 / n_z if foreshortening is None else jnp.exp(-foreshortening * jnp.log(n_z))
-    return -jnp.stack(normal[:2]) * power[None]
+    return jnp.stack([-normal[0] * power, -normal[1] * power])
 
 
 # ------------------------------------------------------------------------------------------- the chart
@@ -64,9 +64,10 @@ def _power(s, exponent):
 
 
 def to_chart(g, foreshortening, bend):
-    """phi(g), `[2, H, W]`; bend: [], b in [0, 1]."""
+    """phi(g), two planes; bend: [], b in [0, 1]."""
     _, s, _, exponent = _stretch(g, foreshortening, bend)
-    return g / _power(s, exponent)[None]
+    shrink = 1 / _power(s, exponent)
+    return g[0] * shrink, g[1] * shrink
 
 
 def from_chart(g, foreshortening, bend):

@@ -247,8 +247,11 @@ def _hessian(g, places, link_x, link_y, c, foreshortening, bend, always):
         if bend is None:
             return d_x, d_y
         scale, along = gradient.from_chart(g, foreshortening, bend)
-        turn = lambda d: scale[None] * (d + (along * (g[0] * d[0] + g[1] * d[1]))[None] * g)  # noqa: E731
-        return turn(d_x), turn(d_y)
+        s_x, s_y = along * (g[0] * d_x[0] + g[1] * d_x[1]), along * (g[0] * d_y[0] + g[1] * d_y[1])
+        return (
+            (scale * (d_x[0] + s_x * g[0]), scale * (d_x[1] + s_x * g[1])),
+            (scale * (d_y[0] + s_y * g[0]), scale * (d_y[1] + s_y * g[1])),
+        )
 
     def plain(g, d_x, d_y, c):
         (u_x, v_x), (u_y, v_y) = slopes(g, d_x, d_y)
@@ -265,8 +268,8 @@ def _hessian(g, places, link_x, link_y, c, foreshortening, bend, always):
         xy = (m_xx * v_x + m_xy * v_y) + (m_yx * u_x + m_yy * u_y)
         return unit * (m_xx * u_x + m_xy * u_y), (0.5 * unit) * xy, unit * (m_yx * v_x + m_yy * v_y)
 
-    planes = g if bend is None else stored(always, lambda g: gradient.to_chart(g, foreshortening, bend), g)
-    d_x, d_y = derivatives(planes, link_x, link_y, always)
+    planes = tuple(g) if bend is None else stored(always, lambda g: gradient.to_chart(g, foreshortening, bend), g)
+    d = derivatives(planes, link_x, link_y, always)
     if places is None:
-        return stored(always, plain, g, d_x, d_y, c)
-    return stored(always, displaced, g, d_x, d_y, *derivatives(places, link_x, link_y, always), c)
+        return stored(always, plain, g, *d, c)
+    return stored(always, displaced, g, *d, *derivatives(tuple(places), link_x, link_y, always), c)
