@@ -197,6 +197,46 @@ def test_occlusion_lines_of_a_mesh_lie_within_a_pixel_of_its_depth_steps(knot):
     assert np.mean(ndimage.distance_transform_edt(~close)[outline] <= 1.5) > 0.97
 
 
+def noisy_ripples(n=161, noise=0.004):
+    """A sheet with waves around its centre, and noise on its right half."""
+    y, x = np.mgrid[-1 : 1 : n * 1j, -1 : 1 : n * 1j]
+    r = np.hypot(x, y)
+    z = 0.05 * np.cos(22 * r) / (1 + 0.5 * r)
+    z += np.where(x > 0, noise, 0) * np.random.default_rng(5).normal(size=z.shape)
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = i[:-1, :-1], i[:-1, 1:], i[1:, :-1], i[1:, 1:]
+    faces = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, b, d), (a, d, c))])
+    return se.make_mesh(np.float32(np.stack([x, y, z], -1).reshape(-1, 3)), np.int32(faces))
+
+
+@pytest.mark.slow
+def test_lines_of_a_noisy_mesh_agglomerate_with_distance():
+    """TH10 fig. 7.4: from afar the noise is gone, lines become fewer, none of them is a speckle."""
+    mesh, size = noisy_ripples(), 240
+    counts, speckles, ink = [], [], []
+    for distance in (1, 2, 4):
+        camera = se.orthographic_camera((0, -1.2, 2.0), (0, 0, 0), height=1.9 * distance, aspect=1.0)
+        gbuffer = se.render_gbuffer(mesh, camera, height=size, width=size)
+        descriptor = se.describe(gbuffer, sigma=1.5)
+        brush = se.style_brush("ink", "valley", height=600)
+        field = se.line_field("valley", gbuffer, descriptor)
+        profile = se.fit_profile(field, least=float(brush.low))
+        drawn = np.asarray(se.draw_lines(profile, field, brush, gbuffer=gbuffer, descriptor=descriptor))[..., 3] > 0.5
+        labels, count = ndimage.label(drawn, np.ones((3, 3)))
+        area = np.bincount(labels.ravel())[1:]
+        counts.append(count)
+        speckles.append(area[area < 12].sum() / area.sum())
+        halves = np.asarray(gbuffer.mask).nonzero()[1]
+        middle = (halves.min() + halves.max() + 1) // 2
+        ink.append(drawn[:, middle:].sum() / drawn[:, :middle].sum())
+    assert counts[0] > 3 * counts[1]
+    assert counts[1] >= counts[2]
+    assert 8 <= counts[2] <= 20  # about as many as there are rings and cut corners
+    assert max(speckles[1:]) < 0.04
+    assert abs(ink[1] - 1) < 0.15  # the noisy half is drawn like the clean one
+    assert abs(ink[2] - 1) < 0.15
+
+
 # ------------------------------------------------------------------------------------------- singularities, smoothing
 
 

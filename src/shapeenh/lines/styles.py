@@ -25,7 +25,7 @@ _WARM, _COOL, _LIGHT = (0.22, 0.06, 0.02), (0.02, 0.03, 0.09), (1.0, 0.97, 0.9)
 
 _COMMON = {
     "ink": Brush(radius=1.2, flow=3.5),
-    "pencil": Brush(color=(0.05, 0.05, 0.06), radius=1.0, flow=2.2, paper=0.75, wobble=0.8, tint=0.2),
+    "pencil": Brush(color=(0.05, 0.05, 0.06), radius=1.1, flow=3.2, paper=0.6, wobble=0.7, tint=0.2),
     "airbrush": Brush(color=_WARM, radius=3.5, width=1.0, spread=0.5, flow=1.4),
     "charcoal": Brush(color=(0.03, 0.025, 0.02), radius=2.6, width=1.0, spread=0.2, flow=2.5, paper=0.6, grow=0.6),
     "calligraphy": Brush(color=_COOL, radius=2.6, aspect=0.45, flow=3.5, grow=0.8),
