@@ -148,7 +148,7 @@ def _smoothing(sigma, importance, scheme: str) -> tuple[int, bool, bool]:
     """
     known = is_concrete(sigma, importance)
     longest = 0.5 * (float(sigma) if known else diffusion.GREATEST_SIGMA) ** 2
-    chart = not known or importance is not None or sigma < 2
+    chart = not known or importance is not None or float(sigma) < 2
     if importance is not None or scheme == "explicit":
         steps = longest / STEP
         if known and importance is not None:
