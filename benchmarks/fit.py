@@ -151,7 +151,7 @@ def conclude(rows) -> str:
     cost = {solver: np.median([r["cost_median"] for r in found]) for solver, found in of.items()}
     met = min(r["met"] for r in of["newton"])
     return (
-        f"Default: Newton steps inside the box; {100 * met:.0f} % or more of the fits meet their target. In plain "
+        f"Default: Newton steps inside the box; {100 * met:.0f} % of the fits meet their target. In plain "
         f"pictures a fit costs {cost['newton']:.0f}, with scipy's L-BFGS-B {cost['scipy']:.0f} (a gradient counts as "
         "two more)."
     )
