@@ -116,6 +116,21 @@ def test_height_fields_normal_maps_and_points_are_inputs_too(tmp_path):
         assert np.abs(image[:, :48] - image[:, 48:]).max() > 3
 
 
+def test_a_point_cloud_is_known_by_its_name_or_its_header(tmp_path):
+    points = np.asarray(se.torus(segments=12).vertices)
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n" + "".join(f"property float {c}\n" for c in "xyz")
+    lines = "\n".join(" ".join(map(str, p)) for p in points.tolist())
+    (tmp_path / "cloud.ply").write_text(f"{header}end_header\n{lines}\n")
+    np.savetxt(tmp_path / "cloud.xyz", points)
+    pictures = []
+    for name in ("cloud.ply", "cloud.xyz"):
+        out = tmp_path / f"{name}.png"
+        assert main(["render", str(tmp_path / name), "-o", str(out), "--only", "--samples", "1", *SMALL]) == 0
+        pictures.append(se.load_image(out).astype(int))
+    assert np.abs(pictures[0] - pictures[1]).max() <= 1
+    assert pictures[0].std() > 5
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

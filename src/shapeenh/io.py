@@ -6,6 +6,7 @@ import contextlib
 import io as _io
 import logging
 import os
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -97,6 +98,18 @@ def load_points(path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
     points = _recentred(path, points, np.arange(len(points)))
     normals, colors = (None if a is None else np.asarray(a, np.float32) for a in (normals, colors))
     return np.asarray(points, np.float32), normals, colors
+
+
+def holds_points(path) -> bool:
+    """Whether a file is a point cloud: by its suffix, or a PLY whose header tells of no faces."""
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix != ".ply" or not path.is_file():
+        return suffix in POINT_SUFFIXES and suffix != ".ply"
+    with path.open("rb") as file:
+        header = file.read(1 << 16).partition(b"end_header")
+    faces = re.search(rb"element\s+(?:face|tristrips)\s+(\d+)", header[0])
+    return bool(header[1]) and (faces is None or int(faces[1]) == 0)
 
 
 def _read_ply_points(path: Path):

@@ -50,7 +50,12 @@ def add_arguments(parser) -> None:
     add(
         "input", nargs="?", metavar="MESH", help="mesh, point cloud, height field or normal map; default: a carved knot"
     )
-    add("--as", dest="kind", choices=KINDS, help="what the input is (default: mesh; images need 'height' or 'normals')")
+    add(
+        "--as",
+        dest="kind",
+        choices=KINDS,
+        help="what the input is (default: mesh or points, by the file; images need 'height' or 'normals')",
+    )
     add("--env", default="studio", metavar="MAP", help=".exr, .hdr or image; or 'studio', 'sky' (default: studio)")
     add("--lights", type=int, default=54, metavar="N", help="directions sampled from the map (default: 54)")
     add("--material", type=values.material, default="stone", metavar="NAME|D,S,ETA", help=values.material_help())
@@ -118,7 +123,8 @@ def _kind(arguments) -> str:
     """What the input is: as told, else by its suffix."""
     if arguments.kind is not None and arguments.input is None:
         raise UsageError(f"--as {arguments.kind} needs an input file")
-    kind = arguments.kind or "mesh"
+    by_name = "points" if arguments.input and io.holds_points(arguments.input) else "mesh"
+    kind = arguments.kind or by_name
     suffix = Path(arguments.input).suffix.lower() if arguments.input else ""
     if arguments.kind is None and suffix in io.PICTURE_SUFFIXES:
         raise UsageError(f"{arguments.input} is an image; accepted with --as height or --as normals")
