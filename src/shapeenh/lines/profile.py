@@ -15,12 +15,13 @@ import numpy as np
 from jax import lax
 
 from shapeenh.checks import check_choice, check_range, check_shape, check_size, check_type, float_dtype, is_concrete
+from shapeenh.fusion import stored, unknown_truth
 from shapeenh.numerics import normalize, smoothstep
 from shapeenh.types import LineField, Profile
 
 GAMMA_MAX = 1.0  # the accumulated singularity that ends a trajectory (TH10 7.2.2)
 LEAST_REACH = 1.0  # px: a neighbourhood narrower than this shows no neighbour on either side, hence no profile
-_OVERSHOOT = 1.8  # a cubic fitted to heights within [0, 1] stays below this between its samples (5 to 65 of them)
+_OVERSHOOT = 1.3  # a maximum of a cubic fitted to heights within [0, 1] is below 1.28, for 5 to 65 samples
 _CHUNK = 1 << 13
 
 
@@ -69,11 +70,20 @@ def fit_profile(field, *, radius: float = 4.0, samples: int = 9, least=0.0) -> P
         raise ValueError(f"field.height has shape {(h, w)}; accepted are images of at least one pixel")
     if not is_concrete(field, least):
         return _fit_everywhere(field, least, **options)
-    planes, candidates = _prepare(field, least, radius=float(radius))
-    index = np.flatnonzero(np.asarray(candidates))
-    listed = np.zeros(_CHUNK * (h * w // _CHUNK + 1), np.int32)  # one size per image: nothing recompiles
-    listed[: index.size] = index
-    return _fit_listed(planes, jnp.asarray(listed), jnp.asarray(index.size, jnp.int32), least, **options)
+    planes = _stored_planes(field)
+    listed, counts = _list(*map(np.asarray, _candidates(planes, least, radius=float(radius))))
+    return _fit_listed(planes, listed, counts, least, **options)
+
+
+def _list(candidates, held):
+    """(pixels [n] int32, chunks [2] int32): first those that no singularity is near, then the others."""
+    size = candidates.size
+    listed = np.full(_CHUNK * (size // _CHUNK + 3), size, np.int32)  # one length per image: nothing recompiles
+    free, near = np.flatnonzero(candidates & ~held), np.flatnonzero(candidates & held)
+    listed[: free.size] = free
+    start = -(-free.size // _CHUNK)
+    listed[start * _CHUNK : start * _CHUNK + near.size] = near
+    return jnp.asarray(listed), jnp.asarray([start, -(-near.size // _CHUNK)], jnp.int32)
 
 
 @partial(jax.jit, static_argnames=("radius", "samples"))
@@ -87,17 +97,19 @@ def _fit_everywhere(field, least, *, radius, samples) -> Profile:
 
 
 @partial(jax.jit, static_argnames=("radius",))
-def _prepare(field, least, *, radius):
-    """(planes, where a profile higher than `least` is possible [H, W] bool)."""
-    planes = _planes(field)
+def _candidates(planes, least, *, radius):
+    """(where a profile higher than `least` is possible, where a singularity may end a neighbourhood), [H, W] bool."""
     h, w = planes[2].shape
     # A sample lies within ceil(radius) pixels of its pixel, and is read from the four pixels around it.
     highest = _box(jnp.maximum, planes[0], int(np.ceil(radius)), h, w)
     lowest = _box(jnp.minimum, planes[0], int(np.ceil(radius)), h, w)
-    # The cubic stays below lowest + _OVERSHOOT (highest - lowest).
+    # Its cubic stays below lowest + _OVERSHOOT (highest - lowest).
     possible = (highest > lowest) & (lowest + _OVERSHOOT * (highest - lowest) > least)
     defined = (planes[2] != 0) | (planes[3] != 0)
-    return planes, possible & defined & (planes[1][1:-1, 1:-1] < GAMMA_MAX)
+    steps = int(np.ceil(radius))
+    faint = min(0.1, 0.9 * GAMMA_MAX / (steps + 1))  # `_barrier` adds these as they are, and they never add up to 1
+    held = _box(jnp.maximum, planes[1], steps, h, w) > faint
+    return possible & defined & (planes[1][1:-1, 1:-1] < GAMMA_MAX), held
 
 
 def _box(pick, padded, reach: int, h: int, w: int):
@@ -115,22 +127,23 @@ def _box(pick, padded, reach: int, h: int, w: int):
 
 
 @partial(jax.jit, static_argnames=("radius", "samples"))
-def _fit_listed(planes, listed, count, least, *, radius, samples) -> Profile:
+def _fit_listed(planes, listed, counts, least, *, radius, samples) -> Profile:
     """`_fit` at the listed pixels alone, in chunks that stay in the cache."""
     height, _, theta_x, theta_y = planes
     h, w = theta_x.shape
     theta_x, theta_y = theta_x.ravel(), theta_y.ravel()
 
-    def chunk(k, out):
+    def chunk(k, out, *, held):
         index = lax.dynamic_slice_in_dim(listed, k * _CHUNK, _CHUNK)
-        index = jnp.where(k * _CHUNK + lax.iota(jnp.int32, _CHUNK) < count, index, h * w)
         inside = jnp.minimum(index, h * w - 1)
         theta = theta_x[inside], theta_y[inside]
-        found = _fit(planes, inside // w, inside % w, *theta, least, radius=radius, samples=samples)
+        found = _fit(planes, inside // w, inside % w, *theta, least, radius=radius, samples=samples, held=held)
         return tuple(o.at[index].set(f, mode="drop", unique_indices=False) for o, f in zip(out, found, strict=True))
 
     empty = jnp.zeros(h * w, height.dtype)
-    out = lax.fori_loop(0, (count + _CHUNK - 1) // _CHUNK, chunk, (empty, empty, empty, jnp.zeros(h * w, bool)))
+    out = (empty, empty, empty, jnp.zeros(h * w, bool))
+    out = lax.fori_loop(0, counts[0], partial(chunk, held=False), out)
+    out = lax.fori_loop(counts[0], counts[0] + counts[1], partial(chunk, held=True), out)
     return Profile(*(o.reshape(h, w) for o in out))
 
 
@@ -144,22 +157,33 @@ def _planes(field):
     height means nothing, but a bilinear read next to it would mix it in: it is extrapolated from its regular
     neighbours, linearly, so that no maximum comes from there.
     """
-    finite = jnp.isfinite(field.height) & jnp.all(jnp.isfinite(field.direction), axis=-1)
-    most = 1e-3 * jnp.finfo(field.height.dtype).max
-    height = jnp.where(finite, jnp.clip(field.height, -most, most), 0)
-    theta = normalize(jnp.where(finite[..., None], field.direction, 0))
-    known = finite & ~jnp.isnan(field.singularity)
-    singular = jnp.where(known, jnp.clip(jnp.where(known, field.singularity, 0), 0, 1), 1)
-    height, singular = jnp.pad(height, 1), jnp.pad(singular, 1, constant_values=1)
-    regular = 1 - smoothstep(0.5, 1.0, singular)
-    height = regular * height + (1 - regular) * _extrapolated(height, regular)
-    return height, singular, theta[..., 0], theta[..., 1]
+
+    def clean(height, direction, singularity):
+        finite = jnp.isfinite(height) & jnp.all(jnp.isfinite(direction), axis=-1)
+        most = 1e-3 * jnp.finfo(height.dtype).max
+        height = jnp.where(finite, jnp.clip(height, -most, most), 0)
+        theta = normalize(jnp.where(finite[..., None], direction, 0))
+        known = finite & ~jnp.isnan(singularity)
+        singular = jnp.where(known, jnp.clip(jnp.where(known, singularity, 0), 0, 1), 1)
+        height, singular = jnp.pad(height, 1), jnp.pad(singular, 1, constant_values=1)
+        regular = 1 - smoothstep(0.5, 1.0, singular)
+        return height, singular, theta[..., 0], theta[..., 1], regular, jnp.pad(height, 2), jnp.pad(regular, 2)
+
+    arrays = field.height, field.direction, field.singularity
+    height, singular, theta_x, theta_y, regular, *around = stored(unknown_truth(*arrays), clean, *arrays)
+    height = regular * height + (1 - regular) * _extrapolated(*around)
+    return height, singular, theta_x, theta_y
+
+
+_stored_planes = jax.jit(_planes)
 
 
 def _extrapolated(height, regular):
-    """2 h(p + d) - h(p + 2d), averaged over those of eight directions d in which both are regular; else h(p + d)."""
-    h, w = height.shape
-    height, regular = jnp.pad(height, 2), jnp.pad(regular, 2)
+    """2 h(p + d) - h(p + 2d), averaged over those of eight directions d in which both are regular; else h(p + d).
+
+    height, regular: with two more pixels of 0 around them.
+    """
+    h, w = height.shape[0] - 4, height.shape[1] - 4
     totals = [jnp.zeros((h, w), height.dtype)] * 4
     for dr, dc in ((r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)):
         near, far = (np.s_[2 + k * dr : 2 + k * dr + h, 2 + k * dc : 2 + k * dc + w] for k in (1, 2))
@@ -251,13 +275,16 @@ def _cubic(height, row, col, theta_x, theta_y, reach, samples: int):
     return a, b, c, d + middle, size
 
 
-def _fit(planes, row, col, theta_x, theta_y, least, *, radius: float, samples: int):
-    """(distance, height, curvature, valid) at integer pixels, as arrays of any shape."""
+def _fit(planes, row, col, theta_x, theta_y, least, *, radius: float, samples: int, held: bool = True):
+    """(distance, height, curvature, valid) at integer pixels, as arrays of any shape.
+
+    held: whether singularities may end the neighbourhood; without, nothing is read to find out.
+    """
     height, singular = planes[:2]
     dtype = height.dtype
     row, col = row.astype(dtype), col.astype(dtype)
     defined = (theta_x != 0) | (theta_y != 0)
-    reach = _reach(singular, row, col, theta_x, theta_y, radius)
+    reach = _reach(singular, row, col, theta_x, theta_y, radius) if held else jnp.full_like(row, radius)
     a, b, c, d, size = _cubic(height, row, col, theta_x, theta_y, reach, samples)
 
     # In units of the largest coefficient nothing over- or underflows; the root does not depend on the unit.
