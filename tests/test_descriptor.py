@@ -230,6 +230,22 @@ def test_skipping_does_not_change_the_result(x64):
         np.testing.assert_allclose(a.gradient, b.gradient, rtol=1e-7, atol=1e-9)
 
 
+def test_only_the_part_that_holds_the_object_is_worked_on(x64, compilations):
+    """In a large image with a small object: the same result as where the mask is not known, 0 around it, and the same
+    code wherever the object is."""
+    large, _ = reference.traced_spheres(300, 440, [((-0.6, 0.3, -9), 1.0), ((-0.2, 0.5, -10.5), 1.2)])
+    g = buffer(large)
+    for sigma in (0.0, 3.0):
+        a = se.describe(g, sigma=jnp.asarray(sigma))  # as an array, too, it is read
+        b = jax.jit(lambda g, sigma=sigma: se.describe(g, sigma=sigma))(g)
+        for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+            assert not np.asarray(x)[~large["mask"]].any()
+            np.testing.assert_allclose(x, y, atol=1e-8)
+    compilations.clear()
+    se.describe(jax.tree.map(lambda a: jnp.roll(a, (40, 60), (0, 1)), g), sigma=jnp.asarray(3.0))
+    assert not [name for name in compilations if "describe" in name]
+
+
 def test_importance_counts_steps(x64):
     fields, _ = reference.waves(*SIZE, wavelength=16.0)
     g = buffer(fields)
