@@ -47,7 +47,7 @@ def decoded(image, green: str, *, stacklevel: int) -> jax.Array:
         raise ValueError(f"image has dtype {image.dtype}; accepted are uint8, uint16 and floats in [0, 1]")
     if image.dtype == np.uint8:
         warnings.warn(
-            "8-bit normals are quantised to half a degree, which shows in curvature: use describe(..., sigma=2) or more "
+            "8-bit normals are quantised to half a degree, which shows in curvature: use a sigma of 2 px or more "
             "(on gentle relief its error is then 2 %, at sigma 0 it is 22 %), or 16 bits",
             stacklevel=stacklevel,
         )
