@@ -261,7 +261,7 @@ def test_the_cubic_term_may_vanish(x64):
 
 def scalar_of(field, name, weights):
     def value(height):
-        found = se.fit_profile(LineField(height, field.direction, field.singularity), least=-np.inf)
+        found = se.fit_profile(LineField(height, field.direction, field.singularity), least=-np.inf, samples=5)
         return jnp.sum(getattr(found, name) * weights)
 
     return value
@@ -277,7 +277,7 @@ def test_gradients_equal_differences(name, x64, rng):
     theta = np.stack([np.cos(angle), np.sin(angle)], -1)
     gamma = np.where((row == 4) & (col > 9), 0.7, 0.02)
     field = LineField(*map(jnp.asarray, (h, theta, gamma)))
-    found = se.fit_profile(field, least=-np.inf)
+    found = se.fit_profile(field, least=-np.inf, samples=5)
     assert np.sum(found.valid) > 40
     # away from where pixels become valid or not, as the docstring says
     steady = np.asarray(found.valid) & (np.abs(found.distance) < 3) & (np.asarray(found.curvature) < -1e-3)
@@ -290,7 +290,7 @@ def test_gradients_are_finite_at_singular_points(rng):
     h, w = 12, 13
 
     def total(*arrays):
-        found = se.fit_profile(LineField(*arrays), least=-np.inf)
+        found = se.fit_profile(LineField(*arrays), least=-np.inf, radius=2.0, samples=5)
         return jnp.sum(found.distance) + jnp.sum(found.height) + jnp.sum(found.curvature)
 
     gradients = jax.jit(jax.grad(total, argnums=(0, 1, 2)))
@@ -305,7 +305,7 @@ def test_gradients_are_finite_at_singular_points(rng):
 
 
 def test_vmap_and_jit():
-    fields = [ripples(s)[0] for s in SHIFTS[:2]]
+    fields = [jax.tree.map(lambda a: a[:20, -24:], ripples(s)[0]) for s in SHIFTS[:2]]
     stacked = jax.tree.map(lambda *a: jnp.stack(a), *fields)
     together = jax.vmap(se.fit_profile)(stacked)
     for k, field in enumerate(fields):
@@ -317,7 +317,7 @@ def test_vmap_and_jit():
 # ------------------------------------------------------------------------------------------- edge cases
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (3, 30)])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9)])
 def test_thin_images(shape, rng):
     field = constant_field(rng.normal(size=shape), direction=(0.6, 0.8))
     found = se.fit_profile(field, least=-np.inf)
