@@ -293,6 +293,12 @@ def test_nodata(kind, nodata):
         assert bool(se.gbuffer_from_height(height, nodata=-9999).mask.all())  # a value that cannot occur
 
 
+def test_eight_bit_heights_warn_with_the_sigma_that_helps():
+    with pytest.warns(UserWarning, match="sigma of 2") as caught:
+        se.gbuffer_from_height(np.arange(12, dtype=np.uint8).reshape(3, 4))
+    assert caught[0].filename == __file__
+
+
 def test_a_large_offset_costs_nothing():
     """Elevations of kilometres with a relief of millimetres, in float64 files and without x64."""
     height, _, _ = saddle(20, 20)
