@@ -147,9 +147,9 @@ class Material:
 class LineField:
     """A height field and a direction field whose ridges are feature lines (TH10 ch. 7).
 
-    height: [H, W]; 0 off the mask.
-    direction: [H, W, 2], unit, image x right, y up; a line, not an arrow; 0 where undefined.
-    singularity: [H, W] in [0, 1].
+    height: [H, W]; 0 off the mask, except of occlusion lines, which straddle the outline and fade out beyond it.
+    direction: [H, W, 2], unit, image x right, y up; a line, not an arrow; 0 where undefined, and where the height is 0.
+    singularity: [H, W] in [0, 1]; 1 off the mask, except for occlusion lines.
     """
 
     height: jax.Array
