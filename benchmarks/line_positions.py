@@ -1,0 +1,89 @@
+"""Where lines lie on real meshes: `python -m benchmarks.line_positions [MESH ...]`.
+
+Shares, over two views and two scales: of strong ridge pixels that are convex and of strong valley pixels that are
+concave (mean curvature of the descriptor; a skeleton pixel is one within half a pixel of its line), of occlusion line
+pixels within a pixel of a depth step (2 % of the object's depth, or the outline), and of the ink of wide brushes that
+spills from one surface onto another, with and without ending footprints at silhouettes.
+Without arguments: the bunny and the armadillo of the folder SHAPEENH_DATA, and the embedded knot.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+import shapeenh as se
+from benchmarks import harness
+
+DIRECTIONS = ((0.34, 0.26, 0.90), (-1.0, 0.2, 0.4))
+
+
+def skeleton(profile):
+    return np.asarray(profile.valid) & (np.abs(profile.distance) <= 0.5)
+
+
+def curved(kind: str, gbuffer, descriptor) -> tuple[int, int]:
+    """(strong skeleton pixels, those of them on their side of flat)."""
+    strong = float(se.style_brush("ink", kind, height=gbuffer.mask.shape[0]).high)
+    on = skeleton(se.fit_profile(se.line_field(kind, gbuffer, descriptor), least=strong))
+    sign = -1 if kind == "ridge" else 1
+    return int(on.sum()), int((sign * np.asarray(se.mean_curvature(descriptor.hessian))[on] > 0).sum())
+
+
+def occluding(gbuffer, descriptor) -> tuple[int, int]:
+    """(skeleton pixels of occlusion lines, those of them next to a step)."""
+    on = skeleton(se.fit_profile(se.line_field("occlusion", gbuffer, descriptor), radius=3.0, least=0.05))
+    mask, depth = np.asarray(gbuffer.mask), np.asarray(gbuffer.depth)
+    seen = np.where(mask, depth, 10 * depth.max())
+    near = np.zeros_like(mask)
+    for axis in (0, 1):
+        jump = np.abs(np.diff(seen, axis=axis)) > 0.02 * np.ptp(depth[mask])
+        for ends in ((1, 0), (0, 1)):
+            near |= np.pad(jump, [ends if k == axis else (0, 0) for k in (0, 1)])
+    wide = np.pad(near, 1)
+    h, w = near.shape
+    near = wide[1:-1, 1:-1] | wide[:h, 1:-1] | wide[2:, 1:-1] | wide[1:-1, :w] | wide[1:-1, 2:]
+    return int(on.sum()), int((on & near).sum())
+
+
+def spilled(gbuffer, descriptor) -> tuple[float, float]:
+    """Ink off the mask as a share of all ink of valleys drawn with a brush of 6 px: (ending at silhouettes, not)."""
+    field = se.line_field("valley", gbuffer, descriptor)
+    brush = se.Brush(radius=6.0, low=0.03, high=0.1)
+    profile = se.fit_profile(field, least=0.03)
+    held = np.asarray(se.draw_lines(profile, field, brush, gbuffer=gbuffer, descriptor=descriptor))[..., 3]
+    free = np.asarray(se.draw_lines(profile, field, brush))[..., 3]
+    off = ~np.asarray(gbuffer.mask)
+    return float(held[off].sum() / held.sum()), float(free[off].sum() / free.sum())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("meshes", nargs="*", type=Path)
+    parser.add_argument("--height", type=int, default=600)
+    arguments = parser.parse_args()
+    paths = arguments.meshes or [p for p in map(harness.data, ("bunny.obj", "armadillo.obj")) if p]
+    meshes = {p.stem: se.load_mesh(p) for p in paths} | {"knot": se.carved_knot()}
+    rows = []
+    for name, mesh in meshes.items():
+        for direction in DIRECTIONS:
+            camera = se.frame_mesh(mesh, direction=direction, aspect=4 / 3)
+            gbuffer = se.render_gbuffer(mesh, camera, height=arguments.height, width=arguments.height * 4 // 3)
+            for sigma in (0.0, 2.0):
+                descriptor = se.describe(gbuffer, sigma=sigma * arguments.height / 600)
+                row = {"mesh": name, "view": direction[0], "sigma": sigma}
+                for kind in ("ridge", "valley"):
+                    total, right = curved(kind, gbuffer, descriptor)
+                    row |= {f"{kind} px": total, f"{kind} right": right / max(total, 1)}
+                total, right = occluding(gbuffer, descriptor)
+                row |= {"occlusion px": total, "at steps": right / max(total, 1)}
+                row["spilled"], row["spilled, TH10"] = spilled(gbuffer, descriptor)
+                rows.append(row)
+    print(harness.table(rows))
+    print(harness.write("line_positions", rows, height=arguments.height))
+
+
+if __name__ == "__main__":
+    main()
