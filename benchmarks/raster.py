@@ -4,7 +4,8 @@
                                 [--prototype FOLDER] [--all]
 
 Without MESH: the embedded object, or bunny.obj (with --all armadillo.obj too) where SHAPEENH_DATA names a folder that
-has them. `--all` takes subdivisions up to 6 million triangles and sizes up to 3840x2160, and half an hour or more.
+has them. By default each mesh and its first subdivision, the latter at the first size only. `--all` takes subdivisions
+up to 6 million triangles and sizes up to 3840x2160, and half an hour or more.
 
 All calls of a scene are timed in turns, so that a slow phase of the machine hits all alike; `first_ms` is compiling and
 running. One process per number of cores: the second finds what the first compiled in a temporary cache, so its
@@ -140,8 +141,11 @@ def worker(options) -> None:
     """Everything on one number of cores; rows as JSON into a file."""
     rows: list[dict] = []
     missing: dict[str, str] = {}
+    least = 0
     for name, mesh in meshes(options):
-        for size in options.sizes:
+        triangles = mesh.faces.shape[0]
+        least = min(least, triangles) or triangles
+        for size in options.sizes[: 1 if options.brief and triangles > least else None]:
             for zoom in options.zoom:
                 width, height = map(int, size.split("x"))
                 rows += scene_rows(options, name, mesh, height, width, zoom, missing)
@@ -249,6 +253,7 @@ def main() -> None:
     parser.add_argument("--worker", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--file", help=argparse.SUPPRESS)
     options = parser.parse_args()
+    options.brief = not (options.all or options.sizes or options.subdivide)
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     sizes = ["800x600", "1920x1080"]
     options.sizes = options.sizes or (["256x256", *sizes, "3840x2160"] if options.all else sizes)

@@ -1,6 +1,7 @@
 """The command line, run as a user would: pictures, buffers, JSON, and one plain line for wrong input."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -77,6 +78,15 @@ def test_only_buffers_and_json(mesh_file, tmp_path, capsys):
     assert record["parameters"]["alpha"] == 30.0
     assert record["triangles"] == 576
     assert set(record["seconds"]["shade warped"]) == {"compile", "run"}
+
+
+def test_a_terminal_is_told_what_goes_on_and_what_compiling_took(mesh_file, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    assert main(["render", str(mesh_file), "-o", str(tmp_path / "o.png"), "--size", "50x34", "--lights", "8"]) == 0
+    said = capsys.readouterr().err
+    assert "shapeenh: G-buffer ...\n" in said
+    took = re.search(r"shapeenh: G-buffer: ([\d.]+) s, of which ([\d.]+) s compiling", said)
+    assert 0 < float(took[2]) <= float(took[1])
 
 
 def test_the_embedded_object_needs_no_file(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import time
@@ -11,7 +12,7 @@ import jax
 
 
 class Stopwatch:
-    """Times the stages and says what goes on, on stderr when that is a terminal.
+    """Times the stages and says what goes on, and how long compiling took, on stderr when that is a terminal.
 
     With `repeat`, a compiled stage is run twice, so that its compile time stands apart from its run time.
     """
@@ -37,9 +38,29 @@ class Stopwatch:
     def _timed(name: str, work):
         if sys.stderr.isatty():
             print(f"shapeenh: {name} ...", file=sys.stderr)
-        start = time.perf_counter()
-        result = jax.block_until_ready(work())
-        return result, round(time.perf_counter() - start, 6)
+        with _compiling() as compiled:
+            start = time.perf_counter()
+            result = jax.block_until_ready(work())
+            seconds = round(time.perf_counter() - start, 6)
+        if sys.stderr.isatty() and sum(compiled) > 0.1:
+            print(f"shapeenh: {name}: {seconds:.1f} s, of which {sum(compiled):.1f} s compiling", file=sys.stderr)
+        return result, seconds
+
+
+@contextlib.contextmanager
+def _compiling():
+    """A list that grows by the seconds of every compilation."""
+    seconds: list[float] = []
+
+    def listen(event, duration, **_):
+        if event in ("/jax/core/compile/jaxpr_to_mlir_module_duration", "/jax/core/compile/backend_compile_duration"):
+            seconds.append(duration)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield seconds
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def use_compilation_cache() -> None:
