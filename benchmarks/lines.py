@@ -37,7 +37,10 @@ def stages(mesh, kind: str, *, width: int, height: int) -> tuple[dict, dict]:
         "field, 10 diffusion steps": lambda: se.line_field(kind, gbuffer, descriptor, sigma=SIGMA).height,
         "fit": lambda: se.fit_profile(field, least=least).distance,
         "draw, footprint 10 px": lambda: se.draw_lines(profile, field, brush),
-        "lines, all three": frame,
+        "draw, ending at silhouettes": lambda: se.draw_lines(
+            profile, field, brush, gbuffer=gbuffer, descriptor=descriptor
+        ),
+        "lines: field, fit, draw": frame,
     }
     return calls, {"covered": int(gbuffer.mask.sum()), "near lines": int(np.asarray(profile.valid).sum())}
 
@@ -61,6 +64,19 @@ def scaling(*, size: int = 768) -> list[dict]:
     return rows
 
 
+def growth(rows: list[dict]) -> dict[str, float]:
+    """Exponents p of cost ~ x^p between the first and the last x: of the pixels near lines, and of the radius."""
+
+    def exponent(first, last, x):
+        return round(float(np.log(last["min_ms"] / first["min_ms"]) / np.log(x)), 2)
+
+    at = {(r["mesh"], r["stage"]): r for r in rows}
+    few, many = (f"stripes every {n} px" for n in (256, 32))
+    stages = ("fit", "draw, radius 2", "draw, radius 4", "draw, radius 8")
+    found = {s: exponent(at[few, s], at[many, s], at[many, s]["near lines"] / at[few, s]["near lines"]) for s in stages}
+    return found | {"radius 2 to 8": exponent(at[many, "draw, radius 2"], at[many, "draw, radius 8"], 4)}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("meshes", nargs="*", type=Path)
@@ -80,8 +96,10 @@ def main() -> None:
     print(harness.table(rows))
     stripes = scaling()
     print(harness.table(stripes))
+    print("growth of the cost with the pixels near lines (1 is linear) and with the radius:", growth(stripes))
     print(f"TH10 8.4, its GPU: {THESIS_MS:.1f} ms per frame")
-    print(harness.write("lines", [*rows, *stripes], size=arguments.size, kind=arguments.kind, thesis_ms=THESIS_MS))
+    facts = {"size": arguments.size, "kind": arguments.kind, "thesis_ms": THESIS_MS, "growth": growth(stripes)}
+    print(harness.write("lines", [*rows, *stripes], **facts))
 
 
 if __name__ == "__main__":
