@@ -1,6 +1,9 @@
 """The whole descriptor, forward and gradient, per option: what is not asked for is not computed, as the time says.
 
-python -m benchmarks.descriptor [--quick]
+    python -m benchmarks.descriptor [--quick]
+
+`gradient, normals`: value and gradient of a scalar with respect to the normals, silhouettes too; `gradient, sigma`:
+with respect to sigma. `times`: over the time of the same scalar's value alone.
 """
 
 from __future__ import annotations
@@ -26,8 +29,27 @@ OPTIONS = {
 }
 
 
-def loss(normal, gbuffer, options):
-    return jnp.sum(se.describe(replace(gbuffer, normal=normal), **options).hessian ** 2)
+SIGMAS = (0.0, 2.5)  # of the gradients
+
+
+def loss(normal, sigma, gbuffer, fixed):
+    """A scalar; `fixed` None: sigma is an argument, else that number."""
+    d = se.describe(replace(gbuffer, normal=normal), sigma=sigma if fixed is None else fixed)
+    return jnp.sum(d.hessian**2)
+
+
+def gradients(gbuffer) -> dict:
+    """name -> call, for every sigma of SIGMAS the value, then the gradients."""
+    calls = {}
+    for s in SIGMAS:
+        at = gbuffer.normal, jnp.asarray(s, gbuffer.normal.dtype)
+        value = partial(loss, gbuffer=gbuffer, fixed=s)
+        calls[f"value, sigma {s:g}"] = partial(jax.jit(value), *at)
+        calls[f"gradient, normals, sigma {s:g}"] = partial(jax.jit(jax.value_and_grad(value)), *at)
+    general = partial(loss, gbuffer=gbuffer, fixed=None)
+    calls["value, any sigma"] = partial(jax.jit(general), *at)
+    calls["gradient, sigma, any sigma"] = partial(jax.jit(jax.value_and_grad(general, 1)), *at)
+    return calls
 
 
 def main(quick: bool) -> None:
@@ -39,11 +61,15 @@ def main(quick: bool) -> None:
         gbuffer = se.render_gbuffer(mesh, camera, height=height, width=width)
         calls = {name: partial(se.describe, gbuffer, **options) for name, options in OPTIONS.items()}
         if not quick:
-            for name in ("sigma 0", "sigma 2.5"):
-                grad = jax.jit(jax.grad(partial(loss, gbuffer=gbuffer, options=OPTIONS[name])))
-                calls[f"gradient, {name}"] = partial(grad, gbuffer.normal)
-        times = measure(calls, repeats=5)
-        rows += [{"image": f"{width}x{height}", "option": name, **times[name]} for name in calls]
+            calls |= gradients(gbuffer)
+        times = measure(calls, repeats=5, seconds=12)
+        value = None
+        for name in calls:
+            row = {"image": f"{width}x{height}", "option": name, **times[name]}
+            value = times[name]["median_ms"] if name.startswith("value") else value
+            if name.startswith("gradient") and value:
+                row["times"] = round(times[name]["median_ms"] / value, 1)
+            rows.append({**row, "times": row.get("times")})
     print(table(rows))
     write("descriptor", rows, mesh=path.name if path else "carved_knot")
 

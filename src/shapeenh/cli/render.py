@@ -13,7 +13,7 @@ from shapeenh import io, pipeline
 from shapeenh.buffers.borrow import resolve_coverage
 from shapeenh.cli import scene, values
 from shapeenh.cli.terminal import Stopwatch
-from shapeenh.descriptor.display import curvature_colors
+from shapeenh.descriptor.display import curvature_colors, curvature_legend
 from shapeenh.descriptor.view import describe, mean_curvature
 from shapeenh.style import tone
 from shapeenh.types import LightWarp
@@ -109,6 +109,8 @@ def _save_buffers(folder: Path, gbuffer, descriptor) -> None:
     io.save_image(folder / "normal.png", _eight_bit(np.where(mask[..., None], 0.5 + 0.5 * normal, 0)))
     io.save_image(folder / "depth.png", _eight_bit(shown))
     io.save_image(folder / "curvature.png", _eight_bit(curvature_colors(descriptor, mask=gbuffer.mask)))
+    if mask.shape[0] >= 64:
+        io.save_image(folder / "curvature-legend.png", _eight_bit(curvature_legend(mask.shape[0])))
     for name, numbers in (("normal", normal), ("depth", depth), ("curvature", curvature)):
         io.save_image(folder / f"{name}.tif", np.float32(numbers))
 

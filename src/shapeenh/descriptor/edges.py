@@ -15,6 +15,7 @@ from shapeenh.stencils import WHOLE, shift, window
 # A step counts in units of the distance between neighbouring samples on the surface. Shading normals of real meshes are
 # up to 20 degrees off their facets (0.34); 0.6 is a step of 0.6 pixels between two surfaces that face the viewer.
 LOW, HIGH = 0.4, 0.8
+TILT = 0.5
 
 
 def _pairs(array, axis: int):
@@ -90,9 +91,17 @@ def _steps(normal, position, size, finite, always):
 
 
 def _far_side(*steps):
-    """The largest of a pixel's four steps that it lies behind: from the pairs right of it, left of it, below, above."""
-    right, left, below, above = steps
-    return (smoothstep(LOW, HIGH, jnp.maximum(jnp.maximum(left, -right), jnp.maximum(above, -below))),)
+    """w_s from the largest of a pixel's four steps that it lies behind.
+
+    steps: for x and for y, those of the pair ahead of the pixel, the pair behind it, and the ones beyond these two.
+    Shading normals that are off their facet show the same small step at every pair on it: what the pairs next to a step
+    show in the same direction is taken off, up to TILT.
+    """
+    behind = []
+    for ahead, back, beyond, before in (steps[:4], steps[4:]):
+        behind.append(back - jnp.clip(jnp.maximum(before, ahead), 0, TILT))
+        behind.append(-ahead - jnp.clip(jnp.maximum(-beyond, -back), 0, TILT))
+    return (smoothstep(LOW, HIGH, jnp.maximum(jnp.maximum(*behind[:2]), jnp.maximum(*behind[2:]))),)
 
 
 def silhouettes(gbuffer, normal, good, always):
@@ -115,9 +124,9 @@ def silhouettes(gbuffer, normal, good, always):
     position, depth, finite = stored(always, clean, gbuffer.position, gbuffer.depth)
     size = footprint(position, depth, finite)
     step_x, step_y = _steps(normal, position, size, finite, always)
-    step_x, step_y = jnp.pad(step_x, ((0, 0), (1, 1))), jnp.pad(step_y, ((1, 1), (0, 0)))
-    reads = ((0, 0), (0, -1)), ((0, 0), (-1, 0))
-    (weight,) = window(_far_side, reads, ((0, 0, 1, 0), (1, 0, 0, 0)), WHOLE, always, step_x, step_y)
+    step_x, step_y = jnp.pad(step_x, ((0, 0), (2, 2))), jnp.pad(step_y, ((2, 2), (0, 0)))
+    reads = tuple((0, k) for k in (0, -1, 1, -2)), tuple((k, 0) for k in (0, -1, 1, -2))
+    (weight,) = window(_far_side, reads, ((0, 0, 2, 1), (2, 1, 0, 0)), WHOLE, always, step_x, step_y)
     if gbuffer.occlusion is not None:
         open_ = jnp.where(jnp.isfinite(gbuffer.occlusion), gbuffer.occlusion, 1)
         weight = jnp.where(jnp.max(size) > 0, weight, 1 - smoothstep(0.25, 0.75, open_))
