@@ -148,6 +148,18 @@ def test_pencils_fade_with_the_height_and_airbrushes_spread_with_smoothness():
     assert spread[0] < spread[1]
 
 
+def test_footprints_swell_with_the_width_of_the_profile():
+    """TH10 fig. 8.5: wide valleys in wide strokes, fine ones in fine strokes, and none wider than the brush."""
+    wide = []
+    for curvature in (-1.0, -1 / 9, -1 / 400):  # half widths of 1, 3 and 20 px
+        profile, field = straight(curvature=curvature)
+        swelled = se.draw_lines(profile, field, se.Brush(radius=5.0, swell=1.0, width=0.5))
+        plain = se.draw_lines(profile, field, se.Brush(radius=min(5.0, (-curvature) ** -0.5), width=0.5))
+        np.testing.assert_allclose(swelled, plain, atol=1e-5)
+        wide.append(np.count_nonzero(np.asarray(swelled)[:, SIZE // 2, 3] > 0.5))
+    assert wide[0] < wide[1] < wide[2]
+
+
 def test_colour_comes_from_the_shading_at_the_skeleton():
     profile, field = straight()  # along x, skeleton at Y = 0
     shading = np.zeros((SIZE, SIZE, 3), np.float32)
@@ -206,6 +218,7 @@ def test_nothing_is_drawn_across_a_silhouette(turned):
         assert not np.any(held[~own])
         kept = np.abs(held - free)[own][:, 3] < 1e-6
         assert np.mean(kept) > (0.97 if turned else 1 - 1e-9)  # and nothing else changes
+    if turned:  # the general variant, as traced, ends footprints at the same places
         traced = jax.jit(lambda p: se.draw_lines(p, field, brush, gbuffer=gbuffer, descriptor=descriptor))(drawn)
         np.testing.assert_allclose(traced, held, atol=2e-5)
 

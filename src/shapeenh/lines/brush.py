@@ -40,6 +40,8 @@ class Brush:
     spread: [], >= 0, added to s: this times sqrt(height / |curvature|), the half width of the profile in px (airbrush).
     low, high: [], heights between which lambda rises from 0 to 1: close together for ink, far apart for a pencil.
     grow: [], in [0, 1], how much of the footprint's size follows that same rise.
+    swell: [], in [0, 1], how much of it follows the half width of the profile, sqrt(height / |curvature|) px, up to
+        `radius` (TH10 fig. 8.5).
     shade: [], in [0, 1], how much of the colour comes from the shading at the skeleton.
     paper, gaps, tint: [], in [0, 1], how much noise takes off the picture, interrupts the line, varies the colour.
     wobble: [], px, how far noise moves a stamp.
@@ -54,6 +56,7 @@ class Brush:
     low: jax.Array | float = 0.0
     high: jax.Array | float = 1e-6
     grow: jax.Array | float = 0.0
+    swell: jax.Array | float = 0.0
     shade: jax.Array | float = 0.0
     paper: jax.Array | float = 0.0
     gaps: jax.Array | float = 0.0
@@ -136,7 +139,7 @@ def _wants(brush, shading, noise, function) -> dict[str, bool]:
         "colored": shaded or tinted,
         "turned": function != "disc",
         "moved": moved,
-        "grown": float(brush.grow) > 0,
+        "grown": float(brush.grow) > 0 or float(brush.swell) > 0,
     }
 
 
@@ -163,6 +166,7 @@ def _check_brush(brush, shading, noise) -> None:
         ("low", -np.inf, np.inf, False),
         ("high", -np.inf, np.inf, False),
         ("grow", 0, 1, False),
+        ("swell", 0, 1, False),
         ("shade", 0, 1, False),
         ("paper", 0, 1, False),
         ("gaps", 0, 1, False),

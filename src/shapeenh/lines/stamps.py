@@ -41,7 +41,8 @@ def stamps_planes(profile, field, brush, shading, noise, *, colored, turned, mov
     profile_width = safe_sqrt(safe_divide(jnp.maximum(height, 0), -profile.curvature))
     s = jnp.minimum(brush.width + brush.spread * profile_width, 64)
     bell = jnp.maximum(rise * jnp.exp(-0.5 * (distance / s) ** 2) - _CUT, 0)  # lambda exp(-d^2 / 2 s^2)
-    radius = brush.radius * (1 - brush.grow + brush.grow * rise)
+    wide = jnp.minimum(profile_width / brush.radius, 1)
+    radius = brush.radius * (1 - brush.grow + brush.grow * rise) * (1 - brush.swell + brush.swell * wide)
     usable = profile.valid & (radius > 1e-3)
     radius = jnp.where(usable, radius, 1)
 
