@@ -69,3 +69,11 @@ def test_eigenvalues_are_ordered_and_symmetric_functions_of_them_have_exact_grad
 def test_errors_say_what_was_given_and_what_is_accepted(call, words):
     with pytest.raises(ValueError, match=words):
         call()
+
+
+def test_quotients_have_gradients_where_the_square_of_the_denominator_underflows():
+    a, b = jnp.float32(3e-30), jnp.float32(1e-30)
+    d_a, d_b = jax.grad(numerics.safe_divide, argnums=(0, 1))(a, b)
+    assert np.allclose([d_a, d_b], [1e30, -3e30], rtol=1e-6)
+    assert jax.grad(numerics.safe_divide, argnums=1)(1, jnp.float32(0)) == 0
+    assert np.allclose(jax.jacfwd(lambda b: numerics.safe_divide(2.0, b))(jnp.arange(3.0)), np.diag([0, -2.0, -0.5]))

@@ -5,20 +5,41 @@ Symmetric 2x2 tensors are `[..., 3]` arrays (xx, xy, yy). Imports nothing of our
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 
 # ------------------------------------------------------------------------------------------- roots and quotients
 
 
 def safe_divide(a, b):
-    """a / b, and 0 with zero gradients where b == 0 (plain division gives inf or NaN there, and 0 * inf in reverse)."""
+    """a / b, and 0 with zero gradients where b == 0 (plain division gives inf or NaN there, and 0 * inf in reverse).
+
+    The derivative is (da - (a/b) db)/b: JAX's own divides by b^2, which is 0 for |b| < 1e-22 in float32.
+    """
+    dtype = jnp.result_type(a, b)
+    return _quotient(jnp.asarray(a, dtype), jnp.asarray(b, dtype))
+
+
+@jax.custom_jvp
+def _quotient(a, b):
     zero = b == 0
     return jnp.where(zero, 0, a / jnp.where(zero, 1, b))
+
+
+@functools.partial(_quotient.defjvp, symbolic_zeros=True)
+def _quotient_jvp(primals, tangents):
+    (a, b), (da, db) = primals, tangents
+    q = _quotient(a, b)
+    change = -q * db if isinstance(da, SymbolicZero) else da if isinstance(db, SymbolicZero) else da - q * db
+    change = jnp.zeros_like(q) if isinstance(change, SymbolicZero) else jnp.broadcast_to(change, q.shape)
+    zero = b == 0
+    return q, jnp.where(zero, 0, change / jnp.where(zero, 1, b))
 
 
 def safe_sqrt(x):

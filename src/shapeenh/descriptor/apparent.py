@@ -43,7 +43,7 @@ def _describe_object(gbuffer, tensor, view):
     size = edges.footprint(position, jnp.where(finite, gbuffer.depth, 1), finite)
 
     # the image axes, turned from z to n by the smallest rotation: x - (x.n)/(1 + n_z) (z + n), seen from the world
-    length = jnp.maximum(jnp.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]), 0.5)
+    length = jnp.sqrt(jnp.maximum(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2], 0.25))
     n = [plane / length for plane in normal]
     shrink = 1 / jnp.maximum(1 + n[2], 1e-6)
     n_x, n_y = n[0], n[1]

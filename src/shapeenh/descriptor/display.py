@@ -41,7 +41,8 @@ def curvature_colors(descriptor, mask, *, scale=None):
     descriptor: Descriptor.
     mask: [H, W] bool, where something is seen.
     scale: [], 1/px, > 0: the |mean curvature| at which colours saturate; None = 60 / H, that is 0.1 at a height of 600.
-    Returns [H, W, 3] in [0, 1], sRGB encoded (to be saved as it is); white off the mask.
+    Returns [H, W, 3] in [0, 1], sRGB encoded (to be saved as it is); white off the mask, and where
+        the Hessian or a weight is not finite.
     Gradient: with respect to the Hessian and the weights.
     Errors: ValueError for a scale that is not positive, or a mask of another size.
     """
@@ -50,10 +51,11 @@ def curvature_colors(descriptor, mask, *, scale=None):
         scale = _default_scale(descriptor.silhouette.shape[0])
     check_range("scale", scale, 0, float("inf"), open_ends=True)
     check_shape("mask", mask, descriptor.silhouette.shape)
-    h = mean_curvature(descriptor.hessian) / scale
     ink = jnp.maximum(descriptor.silhouette, descriptor.crease)
-    colors = curvature_scale(h) * (1 - ink)[..., None]
-    return jnp.where(mask[..., None], colors, 1)
+    seen = mask & jnp.all(jnp.isfinite(descriptor.hessian), axis=-1) & jnp.isfinite(ink)
+    h = mean_curvature(jnp.where(seen[..., None], descriptor.hessian, 0)) / scale
+    colors = curvature_scale(h) * (1 - jnp.where(seen, ink, 0))[..., None]
+    return jnp.where(seen[..., None], colors, 1)
 
 
 # ------------------------------------------------------------------------------------------- the legend

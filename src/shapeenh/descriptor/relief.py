@@ -101,6 +101,7 @@ def _describe_relief(gbuffer, base, sigma, beta, *, levels, scales):
 
     h = jnp.where(good[..., None] & jnp.isfinite(base.hessian), base.hessian, 0)
     size = jnp.max(jnp.abs(h), axis=-1)
+    size = jnp.where(size > np.finfo(h.dtype).tiny ** 0.5, size, 0)  # flatter is flat: 1/size would overflow
     unit = safe_divide(h, size[..., None])
     mean = mean_curvature(unit)
     hessian = unit * safe_divide(strength * jnp.abs(mean), mean * mean + 1e-6 * (size > 0))[..., None]

@@ -23,6 +23,10 @@ def _shade_phong(warped, scaled, gbuffer, hessian, direction, radiance, colours,
     if hessian is not None:
         valid = valid & jnp.all(jnp.isfinite(hessian), axis=-1)
         hessian = jnp.where(valid[..., None], hessian, 0)
+    occlusion = gbuffer.occlusion
+    for image in (*colours.values(), *([] if occlusion is None else [occlusion[..., None]])):
+        valid = valid & jnp.all(jnp.isfinite(image), axis=-1)
+    colours = {name: jnp.where(valid[..., None], image, 0) for name, image in colours.items()}
     z = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 1.0], normal.dtype), normal.shape)
     normal = jnp.where(valid[..., None], normal, z)
     normal = jnp.concatenate([normal[..., :2], jnp.abs(normal[..., 2:])], axis=-1)
@@ -57,8 +61,8 @@ def _shade_phong(warped, scaled, gbuffer, hessian, direction, radiance, colours,
         # A constant has no direction: mean curvature, at full level, brightens what is convex (mean-curvature shading).
         ambient = scaling(ambient, z, options["gamma_ambient"])
     total = total + colours["ambient"] * ambient[..., None]
-    if gbuffer.occlusion is not None:
-        total = total * gbuffer.occlusion[..., None]
+    if occlusion is not None:
+        total = total * jnp.where(valid, occlusion, 0)[..., None]
     if warped:
         total = total * jnp.exp(options["contrast"] * jnp.log(numerics.determinant(tensor)))[..., None]
     return jnp.where(valid[..., None], total, 0)

@@ -44,6 +44,10 @@ def _shade_lookup(look, warped, scaled, gbuffer, hessian, radiance_map, rotation
     if hessian is not None:
         valid = valid & jnp.all(jnp.isfinite(hessian), axis=-1)
         hessian = jnp.where(valid[..., None], hessian, 0)
+    maps = [gbuffer.albedo, None if gbuffer.occlusion is None else gbuffer.occlusion[..., None]]
+    maps = [m for m in maps if m is not None] if look is _diffuse_direction else []
+    for m in maps:
+        valid = valid & jnp.all(jnp.isfinite(m), axis=-1)
     direction = look(normal, options)
     bent, contrast = direction, jnp.ones_like(normal[..., :1])
     if warped:
@@ -60,14 +64,13 @@ def _shade_lookup(look, warped, scaled, gbuffer, hessian, radiance_map, rotation
             if harmonic
             else radiance_map
         )
-        level = numerics.luminance(radiance) / jnp.maximum(jnp.max(numerics.luminance(whole)), 1e-30)
+        level = numerics.safe_divide(numerics.luminance(radiance), jnp.max(numerics.luminance(whole)))
         kappa = curvature_mapping(hessian, direction, options["anisotropy"])
         kappa = jnp.where(kappa > 0, options["concave"] * kappa, kappa)
         radiance = radiance * radiance_scale(kappa, level, options["invariant"], options["gamma"])[..., None]
     radiance = radiance * contrast * tint
-    for map_of in (gbuffer.albedo, gbuffer.occlusion[..., None] if gbuffer.occlusion is not None else None):
-        if map_of is not None and look is _diffuse_direction:
-            radiance = radiance * map_of
+    for m in maps:
+        radiance = radiance * jnp.where(valid[..., None], m, 0)  # a product with NaN would poison the gradient of all
     return jnp.where(valid[..., None], radiance, 0)
 
 
@@ -235,7 +238,9 @@ def _integrate(samples, gbuffer, hessian, radiance_map, rotation, material, alph
     tensor = warp_tensor(jnp.where(valid[..., None], hessian, 0), alpha)
     view = jnp.asarray([0.0, 0.0, 1.0], normal.dtype)
     if gbuffer.albedo is not None:
-        material = Material(material.diffuse * gbuffer.albedo, material.specular, material.shininess)
+        valid = valid & jnp.all(jnp.isfinite(gbuffer.albedo), axis=-1)
+        albedo = jnp.where(valid[..., None], gbuffer.albedo, 0)
+        material = Material(material.diffuse * albedo, material.specular, material.shininess)
 
     @jax.checkpoint
     def add(total, l):

@@ -56,6 +56,6 @@ def radiance_scale(kappa, delta, invariant, gamma):
     ordered, positive = falling >= rising, x >= 0
     small, large = jnp.where(ordered, rising, falling), jnp.where(ordered, falling, rising)
     r = small / large
-    v = jnp.exp(jnp.minimum(jnp.where(positive, x, -x), 0.45 * np.log(np.finfo(dtype).max)))
+    v = jnp.exp(jnp.minimum(jnp.where(positive, x, -x), 0.3 * np.log(np.finfo(dtype).max)))  # v^2 in derivatives
     up = (v + r) / (1 + r * v)
     return jnp.where(ordered == positive, up, 1 / up)

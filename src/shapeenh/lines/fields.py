@@ -310,7 +310,7 @@ def _halved(double, least):
     """(unit direction [2, H, W] of half the angle, whether it is defined); 0 where |double| <= least."""
     length = safe_hypot(double[0], double[1])
     defined = length > least
-    c, s = (jnp.where(defined, d, 0) / jnp.where(defined, length, 1) for d in double)
+    c, s = (safe_divide(jnp.where(defined, d, 0), jnp.where(defined, length, 1)) for d in double)
     # (1 + c, s) or (s, 1 - c), whichever does not vanish
     right = c >= 0
     big = safe_sqrt(0.5 * (1 + jnp.where(right, c, -c)))
