@@ -290,7 +290,7 @@ def test_only_sizes_and_samples_recompile(compilations):
         resolve_coverage(g.normal, coverage)
         if eye == (1, 2, 3):
             compilations.clear()
-    assert not {"jit(sources)", "jit(resolved)", "jit(visible_triangles)"} & set(compilations)
+    assert not {"jit(sources)", "jit(resolved)", "jit(visible_triangles)", "jit(resolve_gbuffer)"} & set(compilations)
 
 
 def test_render_with_samples():
