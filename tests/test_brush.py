@@ -180,6 +180,13 @@ def test_noise_interrupts_takes_off_and_moves():
     paper = np.asarray(se.draw_lines(profile, field, se.Brush(paper=0.5), noise=noise_image(1.0)))
     np.testing.assert_allclose(np.log1p(-paper[..., 3]), 0.5 * np.log1p(-plain[..., 3]), atol=1e-5)
     moved = np.asarray(se.draw_lines(profile, field, se.Brush(wobble=3.0), noise=noise_image(1.0)))
+    lighter = np.asarray(
+        se.draw_lines(profile, field, se.Brush(tint=1.0, color=(0.4, 0.2, 0.1)), noise=noise_image(1.0))
+    )
+    inked = plain[..., 3] > 0.1
+    np.testing.assert_allclose(lighter[..., 3], plain[..., 3], atol=1e-6)  # tint changes the colour alone
+    rgb = lighter[inked][:, :3] / lighter[inked][:, 3:]
+    np.testing.assert_allclose(rgb, np.broadcast_to([0.9, 0.5, 0.3], rgb.shape), atol=1e-4)  # 2 c + 0.1
     # theta points up: stamps move three rows up
     np.testing.assert_allclose(moved[5:-8, 8:-8], plain[8:-5, 8:-8], atol=1e-5)
 
@@ -275,6 +282,26 @@ def test_noise_keeps_its_size_on_the_screen():
 
 
 # ------------------------------------------------------------------------------------------- gradients, errors
+
+
+@pytest.mark.slow
+def test_the_whole_chain_under_vmap_and_jit():
+    """Luminance to strokes, two pictures at once, is the same as one after the other."""
+    images = jnp.asarray(
+        np.stack([0.5 + 0.4 * np.tanh((X[12:28, 11:29] + a * Y[12:28, 11:29]) / 2) for a in (0.2, -0.6)])
+    )
+
+    def draw(image, radius):
+        field = se.line_field("luminance", None, None, luminance=image, sigma=1.0)
+        profile = se.fit_profile(field, least=0.02)
+        return se.draw_lines(profile, field, se.Brush(radius=radius, low=0.02, high=0.1), reach=3)
+
+    radii = jnp.asarray([1.5, 2.0])
+    together = jax.jit(jax.vmap(draw))(images.astype(jnp.float32), radii)
+    for k in range(2):
+        alone = draw(images[k].astype(jnp.float32), float(radii[k]))
+        assert np.max(np.asarray(alone)[..., 3]) > 0.5
+        np.testing.assert_allclose(together[k], alone, atol=1e-4)
 
 
 def test_gradients_equal_differences(x64):
