@@ -174,7 +174,10 @@ def image_camera(gbuffer):
 
 def _run_frames(arguments, inputs) -> None:
     if arguments.kinds != ("luminance",):
-        raise UsageError(f"{inputs[0]} holds pictures without geometry; accepted with --kinds luminance")
+        raise UsageError(
+            f"{inputs[0]} holds pictures without geometry; accepted with --kinds luminance, "
+            "or as one image with --as height or --as normals"
+        )
     if arguments.size is not None:
         raise UsageError("--size is for meshes and points; frames keep their own size")
     source = frames.open_source(inputs)
