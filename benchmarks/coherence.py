@@ -4,7 +4,7 @@ A slow turntable and a slow zoom. Each picture of lines is warped to the next fr
 (positions of the G-buffer, reprojected; pixels that were hidden do not count), and compared with what is drawn there.
 Popping is the ink that appeared or vanished, as a fraction of all ink; `change` counts all of it (a part of which is
 the bilinear warp of lines two pixels wide), `pops` what changed by more than half. Beside our lines (TH10 7.2, 8.1)
-stand the pixels whose curvature exceeds a threshold, the same amount of ink, with a hard and with a soft threshold.
+stand the pixels whose curvature exceeds a threshold (as much ink in the first frame), hard and soft.
 """
 
 from __future__ import annotations
