@@ -30,7 +30,7 @@ GREATEST_SIGMA = 100.0
 # join the cell of a neighbouring block that they are linked to, or else keep their value and wait for the smoothing.
 # A cell knows its volume (in pixels) and the length of its open border with the cell to its right and the one below.
 
-_SMOOTHING = (5, 20)  # explicit steps before and after a descent: on pixels; on blocks of any size
+_SMOOTHING = (4, 20)  # explicit steps before and after a descent: on pixels; on blocks of any size
 _WORTH = 12  # a descent costs as much as about so many steps
 _LEVELS = 2  # blocks of 4 x 4 pixels: there, even sigma = 100 takes a fraction of the other work
 _STRONG = 0.2  # a border less open than that joins nothing
@@ -139,8 +139,8 @@ def _descend(stacks, level: int, time, cells, always, levels: int, sure: bool):
     if level == 0:
         weight = jnp.ones((1, 1), volume.dtype)
     else:
-        link_x, link_y = stored(always, lambda *pair: pair, link_x, link_y)
         weight = jnp.where(volume > 0, 1 / jnp.maximum(volume, 1), 0)
+        link_x, link_y, weight = stored(always, lambda *planes: planes, link_x, link_y, weight)
 
     def smooth(stacks, time, steps):
         slots = slots_for(steps, 8 * 4**level)  # coarse states are small
