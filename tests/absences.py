@@ -331,6 +331,7 @@ NOT_NUMERIC = {
     "records": """Brush Camera Coverage Descriptor FitResult GBuffer LightWarp Lights LineField Material Mesh Profile
         RadianceScaling Visibility""",
     "files": "load_environment load_height load_image load_mesh load_points save_image",
-    "made by NumPy on the host": "carved_knot plane sphere torus procedural_sky procedural_studio",
+    "made by NumPy on the host": "carved_knot plane sphere torus procedural_sky procedural_studio curvature_legend",
+    "display alone": "line_integral_convolution",
     "look-ups by name": "named_material style_brush style_footprint",
 }
