@@ -102,7 +102,8 @@ def describe(gbuffer, *, sigma=0.0, foreshortening=1.0, importance=None, creases
     *Static*: scheme; whether `importance` is given and `creases` asked for. A concrete `sigma` = 0 skips the
         diffusion, a concrete mask what lies around it (in images of 2^17 pixels or more).
     Returns a Descriptor; all its fields are 0 off the mask.
-    *Gradient*: with respect to normals, depth (through the silhouettes' flanks), sigma, foreshortening and importance.
+    *Gradient*: in reverse mode, with respect to normals, depth (through the silhouettes' flanks), sigma, foreshortening
+        and importance.
     *Errors*: ValueError for fields whose shapes disagree, and for numbers out of range.
 
         descriptor = describe(render_gbuffer(mesh, camera, height=600, width=800), sigma=2.5)
