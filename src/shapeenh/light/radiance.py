@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from shapeenh import checks
+from shapeenh.fusion import stored
 from shapeenh.light import brdf, sums, warp
 from shapeenh.light.weights import Model, gain
-from shapeenh.stencils import stored
 from shapeenh.types import Descriptor, GBuffer, Lights, Material
 
 # ------------------------------------------------------------------------------------------- what a pixel brings

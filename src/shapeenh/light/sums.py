@@ -25,9 +25,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from shapeenh.fusion import stored
 from shapeenh.light import blocks
 from shapeenh.light import weights as kernel
-from shapeenh.stencils import stored
 
 SPAN = 128  # lights whose visibility is decided at a time
 
