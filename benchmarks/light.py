@@ -111,7 +111,21 @@ def main() -> None:
     print(harness.table(rows))
     memory = {count: temporaries(g, d, lights_of(count), m) for count in (64, 512, 4096)}
     print("temporaries, MiB, by number of lights:", memory)
-    print(harness.write("light", rows, temporaries_mib=memory))
+    said = conclude(rows)
+    print(harness.write("light", rows, temporaries_mib=memory, answer=said))
+    print(said)
+
+
+def conclude(rows: list[dict]) -> str:
+    ms = {(r["scene"], r["call"]): r["median_ms"] for r in rows}
+    warped, of = ms["ball", "warped"], lambda call: ms["ball", call] / ms["ball", "warped"]  # noqa: E731
+    gradient = ms["ball", "value and gradient"] / ms["ball", "value"]
+    beside = f", {1 / of('peer'):.2f} of the peer's time" if ("ball", "peer") in ms else ""
+    return (
+        f"54 warped lights over 170,000 pixels take {warped:.0f} ms{beside}. Of that time plain light takes "
+        f"{of('plain'):.2f}, radiance scaling {of('scaled'):.2f}, both {of('scaled and warped'):.2f}; a value with its "
+        f"gradient takes {gradient:.1f} times the value's."
+    )
 
 
 def temporaries(gbuffer, descriptor, lights, material) -> float:
