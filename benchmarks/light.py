@@ -118,7 +118,7 @@ def main() -> None:
 
 def conclude(rows: list[dict]) -> str:
     ms = {(r["scene"], r["call"]): r["median_ms"] for r in rows}
-    warped, of = ms["ball", "warped"], lambda call: ms["ball", call] / ms["ball", "warped"]  # noqa: E731
+    warped, of = ms["ball", "warped"], lambda call: ms["ball", call] / ms["ball", "warped"]
     gradient = ms["ball", "value and gradient"] / ms["ball", "value"]
     beside = f", {1 / of('peer'):.2f} of the peer's time" if ("ball", "peer") in ms else ""
     return (
