@@ -98,7 +98,7 @@ def images(draw: Draw, shape, dtype) -> dict:
     depth = np.where(mask, np.abs(depth) + 1e-3, 0)
     x, y = np.meshgrid(np.arange(w) - w / 2, h / 2 - np.arange(h))
     # d/d alpha is about curvature times radiance while alpha times curvature is small: 1e30 times 1e6 overflows itself
-    scale = 10.0 ** (draw.curvature if abs(draw.alpha) >= 1e-3 else min(draw.curvature, 24))
+    scale = 10.0 ** (draw.curvature if abs(draw.alpha) >= 1e-3 else min(draw.curvature, 18))
     hessian = scale * rng.normal(size=(*shape, 3)) * rng.choice([0, 1, 1e-7], size=(*shape, 1), p=[0.2, 0.6, 0.2])
     hessian[..., 1] *= rng.choice([0, 1], size=shape)  # some are diagonal, some umbilics
     hessian[rng.random(shape) < 0.2] = scale * np.array([1.0, 0, 1.0])
