@@ -96,7 +96,8 @@ def viewer_side(position, normal, inverse):
 
 
 def unit(n):
-    """n / |n|, 0 for the zero vector (and no infinite gradient there)."""
+    """n / |n|, 0 with gradient 0 for the zero vector (rsqrt has the slope inf there, and inf * 0 is NaN in reverse)."""
     square = n[0] * n[0] + n[1] * n[1] + n[2] * n[2]
-    inverse = lax.rsqrt(jnp.maximum(square, jnp.finfo(square.dtype).tiny * 1e6))
+    there = square > jnp.finfo(square.dtype).tiny ** 0.5
+    inverse = jnp.where(there, lax.rsqrt(jnp.where(there, square, 1)), 0)
     return [t * inverse for t in n]
