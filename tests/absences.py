@@ -86,6 +86,7 @@ absence(
     lambda s, x: se.sample_coverage(moved(s, x), s.camera, s.gbuffer, samples=2).fraction,
     VERTICES,
     SMALLER,
+    slow=True,
 )
 absence(
     "render",

@@ -182,6 +182,7 @@ claim(
     "render_gbuffer",
     lambda s, v: replace(se.render_gbuffer(mesh(s, v), camera(s, v), height=H, width=W, uv=True), mask=None),
     join(GEOMETRY, pick("mesh", "colors", "uv")),
+    slow=True,
 )
 claim("resolve_coverage", lambda s, v: se.resolve_coverage(v["image"], s.coverage), IMAGE)
 
@@ -207,7 +208,13 @@ claim(
     also(join(GEOMETRY, pick("mesh", "uv"), TEXTURE), strength=0.8),
     variant="tangent",
 )
-claim("apply_normal_map", mapped("object"), join(TEXTURE, pick("mesh", "uv"), pick("camera", "view")), variant="object")
+claim(
+    "apply_normal_map",
+    mapped("object"),
+    join(TEXTURE, pick("mesh", "uv"), pick("camera", "view")),
+    variant="object",
+    slow=True,
+)
 claim(
     "apply_texture",
     lambda s, v: se.apply_texture(gbuffer(s, v), v["texture"]).albedo,
@@ -323,7 +330,7 @@ claim(
     lambda s, v: se.describe_object(gbuffer(s, v), v["tensor"], s.camera),
     join(pick("gbuffer", "normal", "position"), lambda s: {"tensor": s.curvature}),
 )
-claim("describe_apparent", lambda s, v: se.describe_apparent(gbuffer(s, v)), NORMAL)
+claim("describe_apparent", lambda s, v: se.describe_apparent(gbuffer(s, v)), NORMAL, slow=True)
 claim(
     "describe_relief",
     lambda s, v: se.describe_relief(gbuffer(s, v), sigma=v["sigma"], beta=v["beta"], base=descriptor(s, v)).hessian,
@@ -436,7 +443,7 @@ for _name, _tint, _more in (
         also(
             join(NORMAL, HESSIAN, lambda s: {"map": s.map}), rotation=TURN, **{_tint: [0.9, 0.8, 0.7]}, **LOOK, **_more
         ),
-        slow=_name == "shade_refraction",
+        slow=_name != "shade_diffuse",
     )
 claim(
     "shade_forward",
@@ -451,6 +458,7 @@ claim(
         samples=8,
     ),
     also(join(NORMAL, HESSIAN, MATERIAL, lambda s: {"map": s.map}), alpha=5.0, gamma=0.2, rotation=TURN),
+    slow=True,
 )
 PHONG = {
     "ambient": 0.1,
@@ -543,6 +551,7 @@ claim(
     lambda s, v: drawn(s, v, v["footprint"]),
     lambda s: {"footprint": s.noise[:5, :6], "distance": s.profile.distance},
     variant="image",
+    slow=True,
 )
 claim(
     "composite_lines",
