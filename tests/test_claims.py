@@ -19,7 +19,7 @@ from tests.scenes import SCENES, SIZE, make_scene
 
 # The maths is tested here, not what the compiler makes of it: without LLVM's passes it compiles a third faster.
 FAST = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-STEPS = 10.0 ** -np.arange(1, 7.01, 0.25)
+STEPS = 10.0 ** -np.arange(1, 8.01, 0.25)
 DECADE = 5  # samples of a decade, both ends
 ROUNDING = 1e-13  # of a sum of about a thousand terms, relative to their size
 
