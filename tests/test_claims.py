@@ -19,8 +19,9 @@ from tests.scenes import SCENES, SIZE, make_scene
 
 # The maths is tested here, not what the compiler makes of it: without LLVM's passes it compiles a third faster.
 FAST = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-STEPS = 10.0 ** -np.arange(1, 8.01, 0.25)
-DECADE = 5  # samples of a decade, both ends
+STEPS = 10.0 ** -np.arange(1, 8.01, 0.5)
+DECADE = 3  # samples of a decade, both ends
+SMALL = 4  # from here on steps are small enough for a central difference
 ROUNDING = 1e-13  # of a sum of about a thousand terms, relative to their size
 
 
@@ -78,14 +79,14 @@ def check(claim, value, gradient_of, scene, kind, moved):
         remainder = np.abs(ahead - f0 - STEPS * slope)
         taylor = taylor_slope(remainder, floor)
         linear = np.all(remainder[STEPS < 2e-4] <= 10 * floor)
-        errors = [abs((ahead[i] - along(-STEPS[i])) / (2 * STEPS[i]) - slope) for i in range(8, len(STEPS), 4)]
+        errors = [abs((ahead[i] - along(-STEPS[i])) / (2 * STEPS[i]) - slope) for i in range(SMALL, len(STEPS), 2)]
         scale = np.sqrt(np.sum(np.square(g * v)))
         moved[name] |= bool(scale > 0)
         if not (linear or (taylor is not None and taylor >= 1.9)):
             failures.append(
-                f"{name}: Taylor {taylor}, remainders {remainder[::4]}, floor {floor:.1e}, slope {slope:.3g}"
+                f"{name}: Taylor {taylor}, remainders {remainder[::2]}, floor {floor:.1e}, slope {slope:.3g}"
             )
-        if min(errors) > 1e-6 * (abs(slope) + scale) + floor / STEPS[8]:
+        if min(errors) > 1e-6 * (abs(slope) + scale) + floor / STEPS[SMALL]:
             failures.append(f"{name}: slope {slope}, errors {errors}, scale {scale}")
     assert not failures, f"{kind}: " + "\n".join(failures)
 
@@ -133,7 +134,7 @@ def test_stated_absences_are_there_and_hide_a_change(absence, x64):
     after, _ = both(scene, at + step)
     assert np.all(np.isfinite(gradient))
     if absence.kind == "zero":
-        assert np.all(np.asarray(gradient) == 0)
+        assert np.max(np.abs(gradient)) <= 1e-15 * abs(float(after - before))  # nothing but rounding
     assert abs(float(after - before)) > 1e-3 * np.max(np.abs(step))
 
 

@@ -262,29 +262,6 @@ def test_importance_counts_steps(x64):
 # ------------------------------------------------------------------------------------------- gradients
 
 
-@pytest.mark.parametrize("sigma", [pytest.param(0.0), pytest.param(2.1, marks=pytest.mark.slow)])
-def test_gradients_against_differences(x64, rng, sigma):
-    fields, _ = reference.traced_spheres(24, 30, [((0, 0, -5), 1.2), ((1.0, 0.3, -6), 1.3)])
-    g = buffer(fields)
-    weight = jnp.asarray(rng.standard_normal((24, 30, 3)))
-
-    @jax.jit
-    def loss(normal, position, s, f):
-        # at sigma = 0 the concrete zero compiles the variant without diffusion
-        d = se.describe(replace(g, normal=normal, position=position), sigma=s if sigma else 0.0, foreshortening=f)
-        return jnp.sum(weight * d.hessian) + jnp.sum(weight[..., :2] * d.gradient) + jnp.sum(d.silhouette)
-
-    at = (g.normal, g.position, jnp.asarray(sigma), jnp.asarray(0.9))
-    grads = jax.grad(loss, (0, 1, 2, 3))(*at)
-    for i, grad in enumerate(grads):
-        assert np.isfinite(grad).all()
-        direction = jnp.asarray(rng.standard_normal(grad.shape)) * (fields["mask"][..., None] if grad.ndim else 1)
-        ahead, behind = list(at), list(at)
-        ahead[i], behind[i] = at[i] + 1e-6 * direction, at[i] - 1e-6 * direction
-        difference = (loss(*ahead) - loss(*behind)) / 2e-6
-        np.testing.assert_allclose(jnp.sum(grad * direction), difference, rtol=1e-5, atol=1e-5)
-
-
 def test_principal_directions(x64, rng):
     h = jnp.asarray(rng.standard_normal((50, 3)))
     u, v = se.principal_directions(h)

@@ -9,7 +9,6 @@ from scipy import ndimage
 import shapeenh as se
 from shapeenh.types import GBuffer, replace
 from tests.reference import lines as reference
-from tests.reference.differences import assert_gradient
 
 SIZE = 48
 ROW, COL = np.mgrid[0:SIZE, 0:SIZE].astype(float)
@@ -279,25 +278,6 @@ def test_directions_are_smoothed_as_lines(rng):
 
 
 # ------------------------------------------------------------------------------------------- gradients, edge cases
-
-
-def test_gradient_of_height_and_direction(x64, rng):
-    smooth = np.cumsum(np.cumsum(rng.normal(size=(10, 11, 3)), 0), 1) * 0.02
-    d = se.Descriptor(
-        hessian=jnp.asarray(smooth),
-        gradient=jnp.asarray(rng.normal(size=(10, 11, 2))),
-        **{k: jnp.full((10, 11), v) for k, v in (("silhouette", 0.0), ("crease", 0.0), ("conductance", 1.0))},
-    )
-    gbuffer = GBuffer(*(jnp.ones((10, 11, *s)) for s in ((), (), (3,), (3,))))
-    gbuffer = replace(gbuffer, mask=gbuffer.mask > 0)
-    w = jnp.asarray(rng.normal(size=(10, 11, 3)))
-
-    def value(hessian):
-        field = se.line_field("ridge", gbuffer, replace(d, hessian=hessian), sigma=1.2)
-        x, y = field.direction[..., 0], field.direction[..., 1]
-        return jnp.sum(w[..., 0] * field.height + w[..., 1] * x * y + w[..., 2] * x * x)
-
-    assert_gradient(jax.jit(value), d.hessian, rtol=1e-5, directions=2)
 
 
 SLOWER = [pytest.param(k, marks=pytest.mark.slow) for k in ("occlusion", "surface", "luminance", "ridge", "inflection")]

@@ -1,4 +1,4 @@
-"""The whole chain: laws of the picture, gradients, recompilation."""
+"""The whole chain: laws of the picture, recompilation."""
 
 import dataclasses
 
@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import shapeenh as se
-from tests.reference.differences import assert_gradient
 
 SIZE = {"height": 48, "width": 64}
 
@@ -79,55 +78,6 @@ def test_the_picture_does_not_depend_on_the_resolution():
             inside &= np.roll(mask, shift, axis)
     difference = np.abs(small - pooled).mean(axis=-1)[inside & mask]
     assert np.median(difference) < 0.01 * small[mask].mean()
-
-
-@pytest.mark.parametrize("what", ["alpha", "gamma", "sigma", "lights", "material", "normals", "vertices", "camera"])
-def test_gradients_against_central_differences(what, x64):
-    mesh, camera, lights, material = scene(np.float64, lights=6)
-    weights = jnp.asarray(np.random.default_rng(3).normal(size=(48, 64, 3)))
-    visibility_of = {"camera": 0, "vertices": 0}
-
-    def loss(
-        alpha=20.0,
-        gamma=0.3,
-        sigma=12.0,
-        radiance=lights.radiance,
-        shininess=material.shininess,
-        mesh=mesh,
-        camera=camera,
-    ):
-        image = se.render(
-            mesh,
-            camera,
-            se.Lights(lights.direction, radiance),
-            dataclasses.replace(material, shininess=shininess, specular=material.specular * shininess / 20),
-            se.LightWarp(alpha, gamma),
-            sigma=sigma,
-            **SIZE,
-        )
-        return jnp.sum(weights * image) / 100
-
-    if what in ("alpha", "gamma", "sigma"):
-        start = {"alpha": 20.0, "gamma": 0.3, "sigma": 12.0}[what]
-        assert_gradient(lambda v: loss(**{what: v}), jnp.asarray(start), directions=1)
-    elif what == "lights":
-        assert_gradient(lambda v: loss(radiance=v), lights.radiance)
-    elif what == "material":
-        assert_gradient(lambda v: loss(shininess=v), material.shininess, directions=1)
-    elif what == "normals":
-        assert_gradient(
-            lambda v: loss(mesh=dataclasses.replace(mesh, normals=v)), mesh.normals, steps=(1e-6, 1e-7, 1e-8)
-        )
-    else:
-        # Visibility is piecewise constant: with steps far below a pixel the differences see only what is interpolated.
-        assert what in visibility_of
-        if what == "vertices":
-            f = lambda v: loss(mesh=dataclasses.replace(mesh, vertices=v))  # noqa: E731
-            start = mesh.vertices
-        else:
-            f = lambda v: loss(camera=dataclasses.replace(camera, view=v))  # noqa: E731
-            start = camera.view
-        assert_gradient(f, start, steps=(1e-5, 1e-6, 1e-7, 1e-8), directions=3)
 
 
 def test_values_do_not_recompile(compilations):

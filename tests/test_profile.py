@@ -12,7 +12,6 @@ import shapeenh as se
 from shapeenh.lines import profile as module
 from shapeenh.types import LineField
 from tests.reference import lines as reference
-from tests.reference.differences import assert_gradient
 
 # ------------------------------------------------------------------------------------------- ripples (TH10 fig. 7.2)
 #
@@ -257,32 +256,6 @@ def test_the_cubic_term_may_vanish(x64):
 
 
 # ------------------------------------------------------------------------------------------- gradients
-
-
-def scalar_of(field, name, weights):
-    def value(height):
-        found = se.fit_profile(LineField(height, field.direction, field.singularity), least=-np.inf, samples=5)
-        return jnp.sum(getattr(found, name) * weights)
-
-    return value
-
-
-@pytest.mark.parametrize(
-    "name", ["distance", *(pytest.param(n, marks=pytest.mark.slow) for n in ("height", "curvature"))]
-)
-def test_gradients_equal_differences(name, x64, rng):
-    row, col = np.mgrid[0:14, 0:16]
-    h = np.exp(-((col - 7.3 + 0.2 * row) ** 2) / 10) + 0.05 * np.sin(row)
-    angle = 0.2 + 0.02 * row
-    theta = np.stack([np.cos(angle), np.sin(angle)], -1)
-    gamma = np.where((row == 4) & (col > 9), 0.7, 0.02)
-    field = LineField(*map(jnp.asarray, (h, theta, gamma)))
-    found = se.fit_profile(field, least=-np.inf, samples=5)
-    assert np.sum(found.valid) > 40
-    # away from where pixels become valid or not, as the docstring says
-    steady = np.asarray(found.valid) & (np.abs(found.distance) < 3) & (np.asarray(found.curvature) < -1e-3)
-    weights = jnp.asarray(np.where(steady, rng.normal(size=h.shape), 0))
-    assert_gradient(jax.jit(scalar_of(field, name, weights)), field.height, rtol=1e-5, directions=2)
 
 
 def test_gradients_are_finite_at_singular_points(rng):

@@ -57,14 +57,6 @@ def test_lookup_and_its_gradient_are_finite_at_the_poles(dtype, rng):
     assert all(np.all(np.isfinite(g)) for g in gradients)
 
 
-def test_gradient_of_the_lookup(x64, rng):
-    radiance = jnp.asarray(rng.uniform(size=(8, 16, 3)))
-    direction = jnp.asarray([[0.3, 0.5, -0.7], [-0.6, -0.2, 0.4]])
-    weight = jnp.asarray(rng.normal(size=(2, 3)))
-    assert_gradient(lambda d: jnp.sum(weight * se.environment_radiance(radiance, d)), direction)
-    assert_gradient(lambda m: jnp.sum(weight * se.environment_radiance(m, direction)), radiance)
-
-
 def test_prefiltered_map_is_the_cosine_convolution(x64, rng):
     radiance = jnp.asarray(rng.uniform(size=(32, 64, 3)))
     np.testing.assert_allclose(se.prefilter_map(jnp.ones((32, 64, 3)), height=8), 1, rtol=1e-12)
@@ -240,24 +232,6 @@ def test_scaled_ambient_light_is_mean_curvature_shading(x64, rng):
     np.testing.assert_allclose(image[inside], 0.4 * np.exp(-1.5 * np.tanh(mean[inside])), rtol=1e-12)
 
 
-def test_gradients_of_phong(x64, rng):
-    gbuffer, descriptor = ball(x64, rng, curvature=0.5)
-    lights = se.Lights(jnp.asarray([[-0.48, 0.6, 0.64]]), jnp.ones((1, 3)))
-    weight = jnp.asarray(rng.normal(size=(SIZE, SIZE, 3)))
-    given = {"gamma_ambient": 0.4, "gamma_diffuse": 1.5, "gamma_specular": 0.7, "exponent": 0.7, "shininess": 20.0}
-    given |= {"alpha": 1.2, "anisotropy": 0.4, "invariant": 0.4, "contrast": 0.3, "concave": 0.8}
-
-    @jax.jit
-    def image(options):
-        return jnp.sum(weight * se.shade_phong(gbuffer, lights, descriptor=descriptor, **options))
-
-    given = {name: jnp.asarray(value) for name, value in given.items()}
-    gradient = jax.jit(jax.grad(image))(given)
-    for name, value in given.items():
-        found = [(image(given | {name: value + h}) - image(given | {name: value - h})) / (2 * h) for h in (1e-5, 1e-6)]
-        assert min(abs(float(gradient[name] - f)) for f in found) < 1e-6 * max(1, abs(float(gradient[name]))), name
-
-
 # ------------------------------------------------------------------------------------------- occlusion
 
 
@@ -298,19 +272,6 @@ def test_warped_occlusion_without_strength_is_the_plain_one_in_the_limit(x64):
     plain = se.ambient_occlusion(gbuffer, camera, radius=0.6, directions=256)
     warped = se.ambient_occlusion(gbuffer, camera, radius=0.6, directions=256, descriptor=descriptor, alpha=30.0)
     np.testing.assert_allclose(warped, plain, atol=0.02)
-
-
-def test_gradient_of_warped_occlusion(x64, rng):
-    gbuffer, camera = bowl(x64)
-    hessian = jnp.asarray(rng.normal(size=(48, 48, 3)) * 0.1)
-    plane = jnp.ones((48, 48))
-    descriptor = se.Descriptor(hessian, hessian[..., :2], plane, plane, plane)
-    f = jax.jit(
-        lambda a: jnp.mean(
-            se.ambient_occlusion(gbuffer, camera, radius=0.6, directions=8, descriptor=descriptor, alpha=a)
-        )
-    )
-    assert_gradient(f, jnp.asarray(2.0))
 
 
 # ------------------------------------------------------------------------------------------- lit spheres

@@ -112,23 +112,6 @@ def test_normals_that_look_away_are_held_at_grazing(dtype):
     np.testing.assert_allclose(got[1], np.array([0.6, 0, 0.01]) / np.hypot(0.6, 0.01), atol=1e-6)
 
 
-def test_gradients_of_the_normals_source(x64, rng):
-    normal = rng.normal(size=(5, 6, 3)) + np.array([0, 0, 3.0])
-    depth, spacing = rng.uniform(1, 2, (5, 6)), jnp.asarray([0.7, 1.3])
-    weights = [jnp.asarray(rng.normal(size=s)) for s in ((5, 6, 3), (5, 6), (5, 6, 3))]
-
-    def loss(normal, depth, spacing):
-        g = se.gbuffer_from_normals(normal, depth=depth, spacing=spacing)
-        return sum(jnp.sum(w * f) for w, f in zip(weights, (g.normal, g.depth, g.position), strict=True))
-
-    arguments = [jnp.asarray(normal), jnp.asarray(depth), spacing]
-    for k, grad in enumerate(jax.grad(loss, argnums=(0, 1, 2))(*arguments)):
-        direction = jnp.asarray(rng.normal(size=grad.shape))
-        h = 1e-6
-        sides = [loss(*arguments[:k], arguments[k] + s * h * direction, *arguments[k + 1 :]) for s in (1, -1)]
-        np.testing.assert_allclose((sides[0] - sides[1]) / (2 * h), jnp.sum(grad * direction), rtol=1e-7)
-
-
 # ------------------------------------------------------------------------------------------- decoding
 
 
@@ -320,26 +303,6 @@ def test_torn_surfaces():
     assert np.all(silhouette[5:15, 9] == 1)  # the far side of the step
     assert np.all(silhouette[5:15, 10:20] == 0)
     assert np.array_equal(se.gbuffer_from_height(height, max_slope=41.0).normal, whole.normal)
-
-
-def test_gradients_of_the_height_source(x64, rng):
-    height = rng.normal(size=(6, 7))
-    height[2, 3] = np.nan
-    weights = [jnp.asarray(rng.normal(size=s)) for s in ((6, 7, 3), (6, 7), (6, 7, 3))]
-
-    def loss(height, spacing, factor):
-        g = se.gbuffer_from_height(height, spacing=spacing, z_factor=factor)
-        depth = g.depth - g.depth[0, 0] * g.mask  # the plane that depth is measured from is a constant
-        position = g.position - g.position[:1, :1] * g.mask[..., None]
-        return sum(jnp.sum(w * f) for w, f in zip(weights, (g.normal, depth, position), strict=True))
-
-    arguments = [jnp.asarray(height), jnp.asarray([0.8, 1.1]), jnp.asarray(1.7)]
-    for k, grad in enumerate(jax.grad(loss, argnums=(0, 1, 2))(*arguments)):
-        assert bool(jnp.isfinite(grad).all())
-        direction = jnp.asarray(np.where(np.isnan(arguments[k]), 0, rng.normal(size=grad.shape)))
-        h = 1e-6
-        sides = [loss(*arguments[:k], arguments[k] + s * h * direction, *arguments[k + 1 :]) for s in (1, -1)]
-        np.testing.assert_allclose((sides[0] - sides[1]) / (2 * h), jnp.sum(grad * direction), rtol=1e-6)
 
 
 # ------------------------------------------------------------------------------------------- edge cases
