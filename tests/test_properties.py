@@ -297,8 +297,15 @@ TAME = hostile.Draw(
 settings = hypothesis.settings(max_examples=25, deadline=None, derandomize=True, database=None)
 
 
+# Gains at their bound, and a slope in n.l beyond the largest number, once.
+STEEP = hostile.Draw(
+    seed=1, mask="full", normal="long", depth=0.0, curvature=-12, bad=None, alpha=0.0, gamma=1e20, light="any"
+)
+
+
 @pytest.mark.parametrize(("function", "kind"), STAGES.values())
 @settings
+@hypothesis.example(draw=STEEP)
 @hypothesis.given(draw=hostile.draws)
 def test_pictures_and_gradients_of_hostile_inputs_are_finite(function, kind, draw):
     i, p = hostile.images(draw, SHAPE, np.float32), parameters(draw, np.float32)

@@ -149,7 +149,7 @@ def _fifth(x):
 
 def gain(exponent):
     """exp(gamma kappa), held where products of it and of its inverse stay finite: sigma is at its limit there."""
-    bound = 0.4 * np.log(np.finfo(exponent.dtype).max)
+    bound = 0.3 * np.log(np.finfo(exponent.dtype).max)
     return jnp.exp(jnp.clip(exponent, -bound, bound))
 
 
