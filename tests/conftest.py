@@ -1,5 +1,8 @@
 """Strict JAX for every test: x64 is switched on per test by the `x64` fixture; rank promotion is an error."""
 
+import os
+from pathlib import Path
+
 import jax
 import numpy as np
 import pytest
@@ -37,7 +40,16 @@ def x64():
 def forget_programs():
     """Compiled programs of one file are of little use to the next, and a run of all would hold gigabytes of them."""
     yield
-    jax.clear_caches()
+    if _resident_bytes() > 2 << 30:
+        jax.clear_caches()
+
+
+def _resident_bytes() -> float:
+    """Of this process; infinite where the system does not say."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return float("inf")
 
 
 @pytest.fixture

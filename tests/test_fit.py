@@ -311,7 +311,7 @@ def whole_picture():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("names", [("sigma",), ("rotation",), tuple(DEFAULTS)])
+@pytest.mark.parametrize("names", [("sigma",), tuple(DEFAULTS)])
 def test_parameters_of_every_stage_are_fitted_singly_and_together(names, whole_picture):
     """The target is the contrast at a hidden value; another value may reach it too, so the contrast is compared."""
     picture, mask = whole_picture
