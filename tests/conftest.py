@@ -12,14 +12,15 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="run the tests marked slow too")
+    parser.addoption("--thorough", action="store_true", help="run all there are: those marked slow and thorough too")
 
 
 def pytest_collection_modifyitems(config, items):
-    if not config.getoption("--slow"):
-        skip = pytest.mark.skip(reason="slow; runs with --slow")
+    thorough = config.getoption("--thorough")
+    for name, wanted in (("slow", config.getoption("--slow") or thorough), ("thorough", thorough)):
         for item in items:
-            if "slow" in item.keywords:
-                item.add_marker(skip)
+            if name in item.keywords and not wanted:
+                item.add_marker(pytest.mark.skip(reason=f"{name}; runs with --{name}"))
 
 
 @pytest.fixture(params=["float32", "float64"])

@@ -91,9 +91,14 @@ def check(claim, value, gradient_of, scene, kind, moved):
     assert not failures, f"{kind}: " + "\n".join(failures)
 
 
+def tier(entry):
+    """What compiles long runs before a release; the whole chain, with all it is made of, in CI."""
+    return pytest.mark.slow if entry.id == "render" else pytest.mark.thorough
+
+
 def entries(table):
     return {
-        "argvalues": [pytest.param(e, marks=pytest.mark.slow) if e.slow else e for e in table],
+        "argvalues": [pytest.param(e, marks=tier(e)) if e.slow else e for e in table],
         "ids": lambda e: e.id,
     }
 

@@ -336,7 +336,7 @@ def test_bad_pixels_stay_alone(function, kind, bad):
         assert np.array_equal(np.asarray(a)[keep], np.asarray(b)[keep])
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize(("function", "kind"), STAGES.values())
 def test_tiny_images(function, kind):
     """One shape per stage, in turn, since each compiles anew; the tests of the modules have the others."""
@@ -347,7 +347,7 @@ def test_tiny_images(function, kind):
         check_outputs(run(function, i, p, gradient=False), shape, np.float32)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize(("function", "kind"), STAGES.values())
 def test_double_precision_stays_double(function, kind, x64):
     for seed, bad in enumerate(hostile.BAD):
@@ -360,7 +360,7 @@ def test_double_precision_stays_double(function, kind, x64):
 BATCHED_ELSEWHERE = ("shade", "shade_warped", "shade_scaled", "contrast", "line_field", "fit_profile", "draw_lines")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("function", "kind"),
     [stage for name, stage in STAGES.items() if not name.startswith(BATCHED_ELSEWHERE)],
