@@ -53,7 +53,7 @@ def rms(error, on) -> float:
     return float(np.sqrt(np.mean(error[:, on] ** 2)))
 
 
-WANTED = {"planes": 0, "sigma": 2, "conductance": 1, "all": (0, 1, 2)}
+WANTED = {"by planes": 0, "by sigma": 2, "by conductance": 1, "by all": (0, 1, 2)}
 
 
 def reverse(scene: str, plane, conductance, sigma: float) -> list[dict]:
