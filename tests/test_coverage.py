@@ -211,7 +211,7 @@ def test_a_wire_between_the_pixel_centres_is_background():
     assert (np.asarray(coverage.source) == 4).all()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_culling_reaches_the_samples():
     mesh, camera = ball(), se.perspective_camera((0.2, 0, 0), (1, 0, 0), fov_degrees=60, aspect=W / H)
     _, coverage, _, _ = sampled(mesh, camera, 2, cull="back")
@@ -263,7 +263,7 @@ def test_bad_pixels_poison_only_who_borrows_from_them(rng):
     assert np.array_equal(clean[~touched], spoilt[~touched])
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_compiled_is_eager_and_vmap_is_a_loop(rng):
     mesh = ball()
     views = [se.perspective_camera(eye, (0, 0, 0), fov_degrees=30, aspect=W / H) for eye in ((1, 2, 3), (3, 0, 1))]

@@ -286,7 +286,7 @@ def loss(arguments, weights):
 GRADIENT = jax.jit(jax.grad(loss, has_aux=True))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_sums_have_the_gradient_that_autodiff_gives(x64, rng):
     """The hand-written walk back against autodiff of the same sums over a dense table of pairs."""
     camera = cameras()["perspective"]
@@ -349,7 +349,7 @@ def test_jit_and_vmap(rng):
         np.testing.assert_allclose(together.normal[k], apart.normal, atol=5e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_gradients_under_vmap(x64, rng):
     arrays = [jnp.asarray(a) for a in cloud(25, rng, radius=0.5)]
     views = [se.perspective_camera((x, 0.2, 4.0), (0, 0, 0), fov_degrees=32.0, aspect=W / H) for x in (0.1, 0.5)]

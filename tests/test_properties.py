@@ -54,7 +54,7 @@ STAGES = {}
 def stage(function, kind="pixels", slow=False):
     """`function(i, p)` of images and parameters. `kind`: "pixels", each pixel for itself; "neighbours", of a bad normal
     they see what they see of the background; "image" and "input", all else."""
-    STAGES[function.__name__] = pytest.param(function, kind, id=function.__name__, marks=[pytest.mark.slow] * slow)
+    STAGES[function.__name__] = pytest.param(function, kind, id=function.__name__, marks=[pytest.mark.thorough] * slow)
     return function
 
 

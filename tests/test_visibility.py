@@ -349,6 +349,7 @@ def test_eager_without_jit(rng):
         assert np.array_equal(straight, ids(mesh, camera))
 
 
+@pytest.mark.thorough
 def test_vmap_over_cameras_and_over_meshes(rng):
     vertices, faces = soup(rng, 60, 0.3)
     mesh = make(vertices, faces)
