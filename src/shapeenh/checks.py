@@ -16,6 +16,11 @@ def is_concrete(*trees) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
+def is_zero(*values) -> bool:
+    """Known to be zero: concrete, and nothing but zeros."""
+    return all(is_concrete(v) and not np.any(np.asarray(v)) for v in values)
+
+
 def float_dtype(*arrays):
     """float64 where x64 is enabled and an array is float64, float32 for narrower floats, JAX's default without any."""
     given = [np.dtype(a.dtype) for a in arrays if hasattr(a, "dtype")]

@@ -25,6 +25,7 @@ import numpy as np
 
 from shapeenh import codecs, io
 from shapeenh.cli import values
+from shapeenh.cli.terminal import one_line
 from shapeenh.cli.values import UsageError
 
 STILL_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".hdr")
@@ -118,7 +119,7 @@ def _moving(path: Path) -> Source:
         count = int(count) if count is not None and np.isfinite(count) and count > 0 else None
         fps = facts.get("fps") or (1e3 / facts["duration"] if facts.get("duration") and options else None)
     except (OSError, ValueError, KeyError, RuntimeError) as error:
-        raise UsageError(f"{path} cannot be read as a video: {_one_line(error)}") from None
+        raise UsageError(f"{path} cannot be read as a video: {one_line(error)[:200]}") from None
     if count is None and facts.get("fps") and facts.get("duration"):
         count = math.floor(facts["fps"] * facts["duration"] + 0.5)
     modified = path.stat().st_mtime
@@ -131,7 +132,7 @@ def _moving(path: Path) -> Source:
             except StopIteration:
                 return
             except (OSError, ValueError, RuntimeError) as error:
-                raise UsageError(f"{path} cannot be read from frame {k} on: {_one_line(error)}") from None
+                raise UsageError(f"{path} cannot be read from frame {k} on: {one_line(error)[:200]}") from None
             yield Frame(f"frame_{k:05d}", modified, partial(_displayed, picture))
 
     return Source(frames(), count, fps, [path.name])
@@ -299,7 +300,3 @@ def _progress(number: int, count: int | None, drawn: int, seconds: float) -> Non
     print(
         f"\rshapeenh: frame {number}{left}, {drawn / seconds:.1f} per second    ", end="", file=sys.stderr, flush=True
     )
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join((str(error) or type(error).__name__).split())[:200]

@@ -75,6 +75,14 @@ def ashikhmin_shirley(normal, light, view, material):
     return jnp.where(lit, rho, 0)
 
 
+def facing_normal(normal, valid):
+    """[H, W, 3], normals that face the viewer; z where not valid. At the limb, those that turn away are mirrored in the
+    image plane, as in the sums over lights."""
+    z = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 1.0], normal.dtype), normal.shape)
+    normal = jnp.where(valid[..., None], normal, z)
+    return jnp.concatenate([normal[..., :2], jnp.abs(normal[..., 2:])], axis=-1)
+
+
 def check_material(material) -> None:
     """Ranges of the fields of `Material`, looked at where concrete."""
     checks.check_range("material.diffuse", material.diffuse, 0, 1)

@@ -92,7 +92,7 @@ def ambient_occlusion(gbuffer, camera, *, radius, descriptor=None, alpha=0.0, di
     directions = checks.check_size("directions", directions, low=4, high=1024)
     steps = checks.check_size("steps", steps, low=1, high=64)
     dtype = checks.float_dtype(gbuffer.normal)
-    warped = not (checks.is_concrete(alpha) and not np.any(np.asarray(alpha)))
+    warped = not checks.is_zero(alpha)
     hessian = None
     if warped:
         checks.check_type("descriptor", descriptor, Descriptor)

@@ -11,7 +11,8 @@ import numpy as np
 from jax import lax
 
 from shapeenh import checks, numerics
-from shapeenh.light.scaling import curvature_mapping, radiance_scale
+from shapeenh.light.brdf import facing_normal
+from shapeenh.light.scaling import check_strengths, radiance_scale, weighed_curvature
 from shapeenh.light.warp import unwarp, warp_tensor
 from shapeenh.types import Descriptor, GBuffer, Lights
 
@@ -27,16 +28,13 @@ def _shade_phong(warped, scaled, gbuffer, hessian, direction, radiance, colours,
     for image in (*colours.values(), *([] if occlusion is None else [occlusion[..., None]])):
         valid = valid & jnp.all(jnp.isfinite(image), axis=-1)
     colours = {name: jnp.where(valid[..., None], image, 0) for name, image in colours.items()}
-    z = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 1.0], normal.dtype), normal.shape)
-    normal = jnp.where(valid[..., None], normal, z)
-    normal = jnp.concatenate([normal[..., :2], jnp.abs(normal[..., 2:])], axis=-1)
+    normal = facing_normal(normal, valid)
     tensor = warp_tensor(hessian, options["alpha"], concave=options["concave"]) if warped else None
 
     def scaling(level, l, gamma):
         if not scaled:
             return level
-        kappa = curvature_mapping(hessian, l, options["anisotropy"])
-        kappa = jnp.where(kappa > 0, options["concave"] * kappa, kappa)
+        kappa = weighed_curvature(hessian, l, options["anisotropy"], options["concave"])
         return level * radiance_scale(kappa, level, options["invariant"], gamma)
 
     @jax.checkpoint
@@ -59,7 +57,8 @@ def _shade_phong(warped, scaled, gbuffer, hessian, direction, radiance, colours,
     ambient = jnp.ones(normal.shape[:2], normal.dtype)
     if scaled:
         # A constant has no direction: mean curvature, at full level, brightens what is convex (mean-curvature shading).
-        ambient = scaling(ambient, z, options["gamma_ambient"])
+        viewer = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 1.0], normal.dtype), normal.shape)
+        ambient = scaling(ambient, viewer, options["gamma_ambient"])
     total = total + colours["ambient"] * ambient[..., None]
     if occlusion is not None:
         total = total * jnp.where(valid, occlusion, 0)[..., None]
@@ -109,27 +108,18 @@ def shade_phong(
     checks.check_shape("lights.radiance", lights.radiance, np.shape(lights.direction))
     checks.check_range("shininess", shininess, 0, np.inf)
     checks.check_range("exponent", exponent, 0, 1)
-    checks.check_finite("alpha", alpha)
-    checks.check_range("contrast", contrast, -1, 1)
-    checks.check_range("invariant", invariant, 0, 1, open_ends=True)
-    checks.check_range("anisotropy", anisotropy, -1, 1)
-    checks.check_finite("concave", concave)
     strengths = {"gamma_ambient": gamma_ambient, "gamma_diffuse": gamma_diffuse, "gamma_specular": gamma_specular}
-    for name, value in strengths.items():
-        checks.check_range(name, value, 0, np.inf)
-
-    def needed(value):
-        return not checks.is_concrete(value) or bool(np.any(np.asarray(value)))
-
-    warped, scaled = needed(alpha), any(needed(v) for v in strengths.values())
+    options = {"alpha": alpha, "contrast": contrast, "invariant": invariant, "anisotropy": anisotropy} | strengths
+    options |= {"concave": concave}
+    check_strengths(**options)
+    warped, scaled = not checks.is_zero(alpha), not checks.is_zero(*strengths.values())
     dtype = checks.float_dtype(gbuffer.normal)
     hessian = None
     if warped or scaled:
         checks.check_type("descriptor", descriptor, Descriptor)
         checks.check_shape("descriptor.hessian", descriptor.hessian, (*size, 3))
         hessian = jnp.asarray(descriptor.hessian, dtype)
-    options = {"alpha": alpha, "contrast": contrast, "invariant": invariant, "anisotropy": anisotropy} | strengths
-    options |= {"concave": concave, "shininess": shininess, "exponent": exponent}
+    options |= {"shininess": shininess, "exponent": exponent}
     options = {name: jnp.broadcast_to(jnp.asarray(value, dtype), size) for name, value in options.items()}
     colours = {"ambient": ambient, "diffuse": diffuse, "specular": specular}
     for name, value in colours.items():

@@ -11,6 +11,7 @@ import numpy as np
 from shapeenh import checks
 from shapeenh.fusion import stored
 from shapeenh.light import brdf, sums, warp
+from shapeenh.light.scaling import check_strengths
 from shapeenh.light.weights import Model, gain
 from shapeenh.types import Descriptor, GBuffer, Lights, Material
 
@@ -181,11 +182,6 @@ def _prepared_lights(lights, dtype):
     return jnp.asarray(direction, dtype), jnp.asarray(radiance, dtype), jnp.asarray(count, jnp.int32)
 
 
-def _is_zero(*values) -> bool:
-    """Known to be zero: concrete, and nothing but zeros."""
-    return all(checks.is_concrete(v) and not np.any(np.asarray(v)) for v in values)
-
-
 def _check_descriptor(descriptor, gbuffer):
     checks.check_type("gbuffer", gbuffer, GBuffer)
     checks.check_type("descriptor", descriptor, Descriptor)
@@ -224,7 +220,7 @@ def shade_warped(gbuffer, descriptor, lights, material, *, alpha, gamma=0.0, con
     checks.check_finite("alpha", alpha)
     checks.check_range("gamma", gamma, -1, 1)
     checks.check_finite("concave", concave)
-    if _is_zero(alpha):
+    if checks.is_zero(alpha):
         return shade(gbuffer, lights, material)
     options = {"hessian": descriptor.hessian, "alpha": alpha, "contrast": gamma, "concave": concave}
     return _shade(Model(warped=True), gbuffer, lights, material, options)
@@ -259,17 +255,12 @@ def shade_scaled(
     Errors: ValueError for wrong records, shapes, values.
     """
     _check_descriptor(descriptor, gbuffer)
-    checks.check_range("invariant", invariant, 0, 1, open_ends=True)
-    checks.check_range("gamma_diffuse", gamma_diffuse, 0, np.inf)
-    checks.check_range("gamma_specular", gamma_specular, 0, np.inf)
-    checks.check_range("anisotropy", anisotropy, -1, 1)
-    checks.check_finite("concave", concave)
-    checks.check_finite("alpha", alpha)
-    checks.check_range("contrast", contrast, -1, 1)
-    warped = not _is_zero(alpha)
-    if _is_zero(gamma_diffuse, gamma_specular):
+    looks = {"alpha": alpha, "contrast": contrast, "invariant": invariant, "anisotropy": anisotropy}
+    check_strengths(**looks, concave=concave, gamma_diffuse=gamma_diffuse, gamma_specular=gamma_specular)
+    warped = not checks.is_zero(alpha)
+    if checks.is_zero(gamma_diffuse, gamma_specular):
         return shade_warped(gbuffer, descriptor, lights, material, alpha=alpha, gamma=contrast, concave=concave)
-    model = Model(warped=warped, scaled=True, anisotropic=not _is_zero(anisotropy))
+    model = Model(warped=warped, scaled=True, anisotropic=not checks.is_zero(anisotropy))
     options = {"hessian": descriptor.hessian, "concave": concave, "invariant": invariant}
     options |= {"gamma_diffuse": gamma_diffuse, "gamma_specular": gamma_specular}
     if model.anisotropic:

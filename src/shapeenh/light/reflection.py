@@ -14,9 +14,9 @@ import numpy as np
 from jax import lax
 
 from shapeenh import checks, numerics
-from shapeenh.light.brdf import ashikhmin_shirley, check_material
+from shapeenh.light.brdf import ashikhmin_shirley, check_material, facing_normal
 from shapeenh.light.lookup import environment_radiance, harmonic_radiance
-from shapeenh.light.scaling import curvature_mapping, radiance_scale
+from shapeenh.light.scaling import check_strengths, radiance_scale, weighed_curvature
 from shapeenh.light.warp import warp, warp_tensor
 from shapeenh.types import Descriptor, GBuffer, Material
 
@@ -27,10 +27,7 @@ def _shading_normal(gbuffer):
     """(unit normals that face the viewer, where they are valid); z elsewhere."""
     normal = jnp.asarray(gbuffer.normal, checks.float_dtype(gbuffer.normal))
     valid = jnp.asarray(gbuffer.mask, bool) & jnp.all(jnp.isfinite(normal), axis=-1)
-    z = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 1.0], normal.dtype), normal.shape)
-    normal = jnp.where(valid[..., None], normal, z)
-    # As in the sums over lights: at the limb, normals that turn away are mirrored in the image plane.
-    return jnp.concatenate([normal[..., :2], jnp.abs(normal[..., 2:])], axis=-1), valid
+    return facing_normal(normal, valid), valid
 
 
 def _to_map(direction, rotation):
@@ -65,8 +62,7 @@ def _shade_lookup(look, warped, scaled, gbuffer, hessian, radiance_map, rotation
             else radiance_map
         )
         level = numerics.safe_divide(numerics.luminance(radiance), jnp.max(numerics.luminance(whole)))
-        kappa = curvature_mapping(hessian, direction, options["anisotropy"])
-        kappa = jnp.where(kappa > 0, options["concave"] * kappa, kappa)
+        kappa = weighed_curvature(hessian, direction, options["anisotropy"], options["concave"])
         radiance = radiance * radiance_scale(kappa, level, options["invariant"], options["gamma"])[..., None]
     radiance = radiance * contrast * tint
     for m in maps:
@@ -74,23 +70,15 @@ def _shade_lookup(look, warped, scaled, gbuffer, hessian, radiance_map, rotation
     return jnp.where(valid[..., None], radiance, 0)
 
 
-def _is_zero(value) -> bool:
-    return checks.is_concrete(value) and not np.any(np.asarray(value))
-
-
-def _look(look, gbuffer, radiance_map, tint, descriptor, rotation, options):
+def _look(look, gbuffer, radiance_map, tint, descriptor, rotation, options, **more):
+    """Checks, what can be skipped, and the compiled lookup; `options` are strengths, `more` what `look` needs."""
     checks.check_type("gbuffer", gbuffer, GBuffer)
     checks.check_shape("gbuffer.normal", gbuffer.normal, (None, None, 3))
     size = np.shape(gbuffer.normal)[:2]
     checks.check_shape("gbuffer.mask", gbuffer.mask, size)
     checks.check_finite("radiance_map", radiance_map)
-    checks.check_finite("alpha", options["alpha"])
-    checks.check_range("contrast", options["contrast"], -1, 1)
-    checks.check_range("invariant", options["invariant"], 0, 1, open_ends=True)
-    checks.check_range("gamma", options["gamma"], 0, np.inf)
-    checks.check_range("anisotropy", options["anisotropy"], -1, 1)
-    checks.check_finite("concave", options["concave"])
-    warped, scaled = not _is_zero(options["alpha"]), not _is_zero(options["gamma"])
+    check_strengths(**options)
+    warped, scaled = not checks.is_zero(options["alpha"]), not checks.is_zero(options["gamma"])
     dtype = checks.float_dtype(gbuffer.normal)
     hessian = None
     if warped or scaled:
@@ -101,7 +89,7 @@ def _look(look, gbuffer, radiance_map, tint, descriptor, rotation, options):
         rotation = np.eye(3)
     checks.check_shape("rotation", rotation, (3, 3))
     checks.check_finite("rotation", rotation)
-    planes = {name: jnp.broadcast_to(jnp.asarray(value, dtype), size) for name, value in options.items()}
+    planes = {name: jnp.broadcast_to(jnp.asarray(value, dtype), size) for name, value in (options | more).items()}
     tint = jnp.broadcast_to(jnp.asarray(tint, dtype), (*size, 3))
     radiance_map, rotation = jnp.asarray(radiance_map, dtype), jnp.asarray(rotation, dtype)
     return _shade_lookup(look, warped, scaled, gbuffer, hessian, radiance_map, rotation, tint, planes)
@@ -188,9 +176,7 @@ def shade_refraction(
     options = {"alpha": alpha, "contrast": contrast, "invariant": invariant, "gamma": gamma}
     options |= {"anisotropy": anisotropy, "concave": concave}
     common = {"descriptor": descriptor, "rotation": rotation, "options": options}
-    inside = _look(
-        _refracted_direction, gbuffer, radiance_map, transmittance, **(common | {"options": options | {"ior": ior}})
-    )
+    inside = _look(_refracted_direction, gbuffer, radiance_map, transmittance, **common, ior=ior)
     outside = _look(_mirror_direction, gbuffer, radiance_map, 1.0, **common)
     normal, _ = _shading_normal(gbuffer)
     base = ((jnp.asarray(ior, normal.dtype) - 1) / (jnp.asarray(ior, normal.dtype) + 1)) ** 2

@@ -30,6 +30,12 @@ def curvature_mapping(hessian, direction, anisotropy):
     return jnp.tanh(mean + jnp.broadcast_to(jnp.asarray(anisotropy, dtype), shape) * bend)
 
 
+def weighed_curvature(hessian, direction, anisotropy, concave):
+    """`curvature_mapping` with concavities at a strength of their own."""
+    kappa = curvature_mapping(hessian, direction, anisotropy)
+    return jnp.where(kappa > 0, concave * kappa, kappa)
+
+
 def radiance_scale(kappa, delta, invariant, gamma):
     """sigma(kappa, delta): makes radiance brighter or darker where the surface bends.
 
@@ -59,3 +65,14 @@ def radiance_scale(kappa, delta, invariant, gamma):
     v = jnp.exp(jnp.minimum(jnp.where(positive, x, -x), 0.3 * np.log(np.finfo(dtype).max)))  # v^2 in derivatives
     up = (v + r) / (1 + r * v)
     return jnp.where(ordered == positive, up, 1 / up)
+
+
+def check_strengths(*, alpha, contrast, invariant, anisotropy, concave, **gammas) -> None:
+    """Ranges of what all warped and scaled looks have in common, looked at where concrete; `gammas` by their names."""
+    checks.check_finite("alpha", alpha)
+    checks.check_range("contrast", contrast, -1, 1)
+    checks.check_range("invariant", invariant, 0, 1, open_ends=True)
+    for name, gamma in gammas.items():
+        checks.check_range(name, gamma, 0, np.inf)
+    checks.check_range("anisotropy", anisotropy, -1, 1)
+    checks.check_finite("concave", concave)
