@@ -243,6 +243,7 @@ def test_the_target_is_met_from_any_start(measure, start, dtype):
         assert fitted.parameters[name].dtype == dtype
         assert low <= fitted.parameters[name] <= high
     assert 1 <= fitted.renders <= 40
+    assert fitted.reason == ""
 
 
 @pytest.mark.parametrize("start", np.linspace(0, 100, 9))
@@ -430,12 +431,18 @@ def test_a_jump_across_the_target_is_not_converged():
     fitted = se.fit_contrast(jumping, 0.2, 10.0, mask=MASK, bounds=(0.0, 100.0))
     assert fitted.converged is False
     assert fitted.renders < 100
+    low, high = (contrast_of(jumping(a)) for a in (30.7, 30.71))
+    assert fitted.reason == f"the contrast jumps across the target, from {low:.6g} to {high:.6g}"
 
 
 def test_a_spent_budget_is_not_converged():
     fitted = se.fit_contrast(waving, 0.36, 70.0, mask=MASK, bounds=(0.0, 100.0), max_renders=2)
     assert fitted.converged is False
     assert fitted.renders == 2
+    assert fitted.reason == "max_renders = 2 pictures did not do"
+    found = se.fit_image(waving, waving(33.0), 70.0, mask=MASK, bounds=(0.0, 100.0), max_renders=2)
+    assert found.converged is False
+    assert found.reason == fitted.reason
 
 
 def test_a_strength_map_moves_as_little_as_it_can(x64):

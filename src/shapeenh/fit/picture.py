@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -23,6 +23,7 @@ class FitResult:
     steps: moves of the solver.
     renders: pictures rendered, with or without their gradients.
     converged: whether the target was met; for `fit_image`, whether the difference is at a minimum.
+    reason: empty where it converged, else a sentence that says why not.
     """
 
     parameters: Any
@@ -30,6 +31,7 @@ class FitResult:
     steps: int
     renders: int
     converged: bool
+    reason: str = field(default="", metadata={"static": True})
 
 
 def picture(render, parameters, arguments, mask, shape=None):

@@ -24,7 +24,7 @@ class Search:
     target: > 0. tolerance: of |value/target - 1|. budget: of points. dimension: [n] int, which components of u the
     survey moves together. resolution: the smallest step along a segment that changes a point.
 
-    points: [(residual, u)], the residual being value/target - 1.
+    points: [(residual, u)], the residual being value/target - 1. reason: why the search ended without the target.
     """
 
     def __init__(
@@ -35,6 +35,7 @@ class Search:
         self.dimension = dimension
         self.points: list[tuple[float, np.ndarray]] = []
         self.steps = 0
+        self.reason = ""
 
     # --------------------------------------------------------------------------------------- looking
 
@@ -50,7 +51,11 @@ class Search:
     def _record(self, value, u):
         residual = float(value) / self.target - 1
         self.points.append((residual, np.array(u, np.float64)))
-        if abs(residual) <= self.tolerance or len(self.points) >= self.budget:
+        if abs(residual) <= self.tolerance:
+            self.reason = ""
+            raise Stop
+        if len(self.points) >= self.budget:
+            self.reason = f"max_renders = {self.budget} pictures did not do"
             raise Stop
         return residual
 
@@ -121,6 +126,8 @@ class Search:
                 c, fc, b, fb = b, fb, a, fa
             a, fa = new, ahead
             t = _interpolated(a, fa, b, fb, c, fc)
+        ends = sorted(self.target * (1 + f) for f in (fa, fb))
+        self.reason = f"the contrast jumps across the target, from {ends[0]:.6g} to {ends[1]:.6g}"
         raise Stop
 
     def bracket_nearest(self):

@@ -57,7 +57,8 @@ def fit_contrast(
     other side of the target; between two such points a continuous contrast meets it.
 
     Static: measure, solver, tolerance, max_renders. Does not run under `jit` and `vmap`: the course depends on values.
-    Returns: `FitResult`; `converged` is False where `max_renders` did not do or the contrast jumps across the target.
+    Returns: `FitResult`; `converged` is False where `max_renders` did not do or the contrast jumps across the target
+    (in steps of the parameters' precision), and `reason` says which.
     Gradient: of the parameters with respect to target and arguments, by the implicit function theorem: exact for one
     parameter; for several that of the shortest change, in units of the bounds' widths, that follows. Parameters at a
     bound stay there. 0 where the contrast has no slope. The start has no gradient.
@@ -88,6 +89,7 @@ def fit_contrast(
             _meet(search, objective, solver, box.start)
             residual, u = search.best
             course.update(steps=search.steps, renders=objective.renders, converged=search.met)
+            course.update(reason="" if search.met else search.reason)
             return jnp.asarray(u, box.dtype), jnp.asarray(search.target * (1 + residual), box.dtype)
 
     @solution.defjvp

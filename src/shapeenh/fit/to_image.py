@@ -47,7 +47,7 @@ def fit_image(
 
     Static: solver, starts, tolerance, max_renders. Does not run under `jit` and `vmap`: the course depends on values.
     Returns: `FitResult`; `value` is the rms difference over the reference's rms. `converged`: it is within the
-    tolerance, or the best start's solver found no way down.
+    tolerance, or the best start's solver found no way down; `reason` says why not.
     Gradient: none; traced references and arguments are refused.
     Errors: ValueError that names the argument.
 
@@ -80,7 +80,10 @@ def fit_image(
     value, u, success = descent.best
     u = jnp.asarray(u, box.dtype)
     rms = jnp.asarray(np.sqrt(value), box.dtype)
-    return FitResult(box.parameters(u), rms, descent.steps, objective.renders, success or value <= tolerance**2)
+    converged = success or value <= tolerance**2
+    spent = f"max_renders = {max_renders} pictures did not do" if objective.renders >= max_renders else ""
+    reason = "" if converged else spent or f"{solver} ended before it found a minimum"
+    return FitResult(box.parameters(u), rms, descent.steps, objective.renders, converged, reason)
 
 
 class _Descent:
