@@ -1,9 +1,10 @@
 """Faces sorted into size classes without sorting.
 
 Every face gets a class: 0 = nothing to draw (culled, off the image, without area, or between pixel centres), k = its
-pixel centres fit the window WINDOWS[k - 1], LARGE = larger, or cut by the near plane. The faces of a class are then
-*found*, in ascending order and as they are needed: bit words, prefix counts of their population, and a bisection for
-the n-th bit. That is several times faster than a sort or a compaction, has no capacity, and cannot overflow.
+pixel centres fit the window WINDOWS[k - 1], MEDIUM = larger, LARGE = too long for 32 bits, or cut by the near plane.
+The faces of a class are then *found*, in ascending order and as they are needed: bit words, prefix counts of their
+population, and a bisection for the n-th bit. That is several times faster than a sort or a compaction, has no
+capacity, and cannot overflow.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from shapeenh.buffers.xla import lower_bound, take
 from shapeenh.fusion import stored
 
 WINDOWS = ((2, 2), (4, 4), (8, 8))  # rows, columns
-LARGE = len(WINDOWS) + 1
+MEDIUM = len(WINDOWS) + 1
+LARGE = MEDIUM + 1
 LANES = 64  # bit k of word LANES * j + lane is face 32 * LANES * j + LANES * k + lane: neighbours stay neighbours
 BLOCK = 16 * 32 * LANES  # faces per step: what is computed on the way stays in cache
 LONG = 1 << 14  # beyond this extent (64 px) int32 areas could overflow: decided later, in 64 bits
@@ -42,7 +44,7 @@ def classify(x, y, height, width, cull, cells=None, side=1):
     """Class [F] uint8 of faces with snapped corners x, y [3, F]; with `cells`, only of those that touch one."""
     x0, x1, y0, y1 = box = pixel_box(x, y, height, width)
     columns, rows = x1 - x0 + 1, y1 - y0 + 1
-    kind = jnp.full(columns.shape, LARGE, jnp.int32)
+    kind = jnp.full(columns.shape, MEDIUM, jnp.int32)
     for k in reversed(range(len(WINDOWS))):
         kind = jnp.where((rows <= WINDOWS[k][0]) & (columns <= WINDOWS[k][1]), k + 1, kind)
     low_x, high_x = three(jnp.minimum, x), three(jnp.maximum, x)

@@ -215,18 +215,25 @@ def borrowed(always, vertices, normals, view, projection, m, position, normal, f
         index = take(flat_faces, (jnp.maximum(ids, 0) * 3)[:, None] + corner)
         return [table_rows((t.reshape(-1), 3), index) for t in (vertices, normals)]
 
+    stage = functools.partial(stored, always)
+
     def values(rows, fine_x, fine_y):
         """Camera-space position and normal of the samples, [6, S * S, n]."""
         dtype = vertices.dtype
-        p = (fine_x.astype(dtype) + 0.5) * (2 / (width * samples)) - 1
-        q = 1 - (fine_y.astype(dtype) + 0.5) * (2 / (height * samples))
-        relative = []
-        for axis, t in ((0, p), (1, q)):
-            k = [m[axis, c] - t * m[3, c] for c in range(4)]
-            relative.append(sum(k[c][:, None] * rows[0][:, :, c] for c in range(3)) + k[3][:, None])
-        b, _, inverse, _ = barycentrics(*relative)
-        _, place, n = surface(view, b, [blend(b, t) for t in rows], rows, inverse)[:3]
-        return jnp.stack(place + n)
+
+        def weights(m, position, fine_x, fine_y):
+            p = (fine_x.astype(dtype) + 0.5) * (2 / (width * samples)) - 1
+            q = 1 - (fine_y.astype(dtype) + 0.5) * (2 / (height * samples))
+            relative = []
+            for axis, t in ((0, p), (1, q)):
+                k = [m[axis, c] - t * m[3, c] for c in range(4)]
+                relative.append(sum(k[c][:, None] * position[:, :, c] for c in range(3)) + k[3][:, None])
+            b, _, inverse, _ = barycentrics(*relative)
+            return jnp.stack([*b, inverse])
+
+        *b, inverse = stage(weights, m, rows[0], fine_x, fine_y)
+        _, place, n = surface(stage, view, b, [stage(blend, b, t) for t in rows], rows, inverse)[:3]
+        return stage(lambda *planes: jnp.stack(planes), *place, *n)
 
     def around(row, column):
         """Position, normal and whether there is anything, of the 3 x 3 pixels: [9, 6, n] and [9, n]."""
@@ -258,7 +265,7 @@ def borrowed(always, vertices, normals, view, projection, m, position, normal, f
         pixel = lax.dynamic_slice(pixels, (i * chunk,), (chunk,))
         row, column, ids, fine_x, fine_y = stored(always, place, pixel)
         rows = stored(always, corners, ids)
-        value = stored(always, values, rows, fine_x, fine_y)
+        value = values(rows, fine_x, fine_y)
         near, there = stored(always, around, row, column)
         chosen = stored(always, choose, value, near, there, ids)
         share = jnp.sum((chosen >= 0).astype(jnp.float32), axis=0) * (1 / square)

@@ -74,14 +74,20 @@ def resolve_gbuffer(vertices, faces, tables, view, projection, triangle) -> GBuf
     return GBuffer(mask=triangle >= 0, **{**fields, "depth": fields["depth"][..., 0]})
 
 
-def surface(view, b, blended, rows, inverse):
+def surface(stage, view, b, blended, rows, inverse):
     """Depth, camera-space position and normal, then the other attributes as they are."""
     point, normal, *others = blended
-    x, y, z = (sum(view[k, c] * point[:, c] for c in range(3)) + view[k, 3] for k in range(3))
-    side = lax.stop_gradient(viewer_side(rows[0], rows[1], inverse))
-    n = [sum(view[k, c] * normal[:, c] for c in range(3)) * side for k in range(3)]
-    n = unit(n)
-    n = unit([n[0], n[1], jnp.maximum(n[2], GRAZING)])
+
+    def turned(view, point, normal, rows, inverse):
+        side = lax.stop_gradient(viewer_side(rows[0], rows[1], inverse))
+        position = [sum(view[k, c] * point[:, c] for c in range(3)) + view[k, 3] for k in range(3)]
+        return jnp.stack(position + [sum(view[k, c] * normal[:, c] for c in range(3)) * side for k in range(3)], 1)
+
+    made = stage(turned, view, point, normal, rows[:2], inverse)
+    x, y, z, *n = (made[:, k] for k in range(6))
+
+    n = unit(stage, n)
+    n = unit(stage, [n[0], n[1], jnp.maximum(n[2], GRAZING)])
     return [[-z], [x, y, z], n, *([t[:, k] for k in range(t.shape[1])] for t in others)]
 
 
@@ -95,9 +101,13 @@ def viewer_side(position, normal, inverse):
     return jnp.where((out * jnp.sign(inverse)) < 0, -1, 1).astype(position.dtype)
 
 
-def unit(n):
-    """n / |n|, 0 with gradient 0 for the zero vector (rsqrt has the slope inf there, and inf * 0 is NaN in reverse)."""
+def unit(stage, n):
+    inverse = stage(inverse_length, n)
+    return [t * inverse for t in n]
+
+
+def inverse_length(n):
+    """1 / |n|; 0 with gradient 0 for the zero vector (rsqrt has the slope inf there, and inf * 0 is NaN in reverse)."""
     square = n[0] * n[0] + n[1] * n[1] + n[2] * n[2]
     there = square > jnp.finfo(square.dtype).tiny ** 0.5
-    inverse = jnp.where(there, lax.rsqrt(jnp.where(there, square, 1)), 0)
-    return [t * inverse for t in n]
+    return jnp.where(there, lax.rsqrt(jnp.where(there, square, 1)), 0)

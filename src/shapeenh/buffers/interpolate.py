@@ -52,11 +52,11 @@ def check_seen(mesh, camera, visibility) -> None:
     check_camera(camera)
 
 
-def attributes(view, b, blended, rows, inverse):
+def attributes(stage, view, b, blended, rows, inverse):
     return [[blended[1][:, k] for k in range(blended[1].shape[1])]]
 
 
-def corner_weights(view, b, blended, rows, inverse):
+def corner_weights(stage, view, b, blended, rows, inverse):
     return [list(b)]
 
 

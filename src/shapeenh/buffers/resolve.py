@@ -107,8 +107,10 @@ def forward(finish, position, tables, view, m, faces, ids):
     flat, group, runs, total, packed, flat_faces = prepare(position, tables, faces, ids)
     size = flat.size
 
+    stage = functools.partial(stored, always)
+
     def values(view, b, rows, inverse):
-        return finish(view, b, [blend(b, t) for t in rows], rows, inverse)
+        return finish(stage, view, b, [stage(blend, b, t) for t in rows], rows, inverse)
 
     lane = jax.ShapeDtypeStruct((1, LANES), dtype)
     shapes = jax.eval_shape(
@@ -123,27 +125,31 @@ def forward(finish, position, tables, view, m, faces, ids):
         i, fields = state
         start = run_start(lax.dynamic_slice(runs, (i * group,), (group,)), size)
         covered, _, rows = corners(always, packed, flat_faces, flat, start)
-        ax, ay = stored(always, lambda m, start, x: relative(m, start, x, height, width), m, start, rows[0])
+        # each stage makes one array: of a list of results, every one would compute what they have in common
+        a = stage(lambda m, start, x: jnp.concatenate(relative(m, start, x, height, width), 1), m, start, rows[0])
 
-        def weights(ax, ay):
-            b, _, inverse, _ = barycentrics(ax, ay)
-            return jnp.stack([*b, inverse], 1)  # one kernel: a list of results would be computed once for each
+        def weights(a):
+            b, _, inverse, _ = barycentrics(a[:, :3], a[:, 3:])
+            return jnp.stack([*b, inverse], 1)
 
-        packed_b = stored(always, weights, ax, ay)
-        b, inverse = [packed_b[:, k] for k in range(3)], packed_b[:, 3]
+        packed_b = stage(weights, a)
+        made = values(view, [packed_b[:, k] for k in range(3)], rows, packed_b[:, 3])
 
-        def last(view, b, rows, inverse, covered):
-            return [[jnp.where(covered, t, 0) for t in field] for field in values(view, b, rows, inverse)]
+        def last(field, covered):
+            # channel-last, as it will stay: interleaving whole images later would cost more than computing them
+            return interleave([jnp.where(covered, t, 0) for t in field])
 
-        new = stored(always, last, view, b, rows, inverse, covered)
-        # channel-last, as it will stay: interleaving whole images later would cost more than computing them
-        new = stored(always, lambda new: [interleave(field) for field in new], new)
+        new = [stage(last, field, covered) for field in made]
         writes = zip(fields, new, counts, strict=True)
         return i + 1, [write_runs(t, start * count, u) for t, u, count in writes]
 
     fields = lax.while_loop(lambda state: state[0] * group < total, step, (jnp.int32(0), fields))[1]
     used = height * width
     return [t[: used * n].reshape((height, width, n)) for t, n in zip(fields, counts, strict=True)]
+
+
+def unstaged(function, *args):
+    return function(*args)
 
 
 def interleave(planes):
@@ -194,7 +200,9 @@ def backward(finish, position, tables, view, m, faces, ids, cotangents):
                 new = read_runs(t, start * n, LANES * n).reshape(group, LANES, n)
                 g.append([jnp.where(covered, new[..., k], 0) for k in range(n)])
             blended = [blend(b, t) for t in rows]
-            _, pull = jax.vjp(lambda view, b, blended: finish(view, b, blended, rows, inverse), view, b, blended)
+            _, pull = jax.vjp(
+                lambda view, b, blended: finish(unstaged, view, b, blended, rows, inverse), view, b, blended
+            )
             g_view, g_b, g_blended = pull(g)
             return g_view, g_b, g_blended
 
@@ -255,9 +263,10 @@ def backward(finish, position, tables, view, m, faces, ids, cotangents):
 def resolve(finish: Callable, position, tables, view, m, faces, ids):
     """Fields [H, W, C] that `finish` makes of interpolated positions and tables; 0 off the mask.
 
-    finish(view, b, blended, rows, inverse) -> per field a list of C planes [runs, LANES]: b the three weights, blended
-    [runs, columns, LANES] of the position and each table, rows [runs, 3, columns, LANES] their corners (constants of
-    the derivative), inverse 1/s, whose sign is positive for a front face.
+    finish(stage, view, b, blended, rows, inverse) -> per field a list of C planes [runs, LANES]: b the three weights,
+    blended [runs, columns, LANES] of the position and each table, rows [runs, 3, columns, LANES] their corners
+    (constants of the derivative), inverse 1/s, whose sign is positive for a front face. stage(function, *args) calls
+    the function, and on the way forward stores what it returns.
     """
     return one_view(finish, position, tables, view, m, faces, ids)
 

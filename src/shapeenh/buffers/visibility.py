@@ -15,20 +15,22 @@ import numpy as np
 from jax import lax
 
 from shapeenh import checks
-from shapeenh.buffers.bins import WINDOWS, ascending, bin_faces, corner_indices, select
+from shapeenh.buffers.bins import LARGE, WINDOWS, ascending, bin_faces, corner_indices, select
 from shapeenh.buffers.inputs import check_camera, check_mesh
 from shapeenh.buffers.project import SUB, clip_matrix, nearness, nearness_shift, project
-from shapeenh.buffers.tiles import FACES, TILE, draw_tiles, tile_count
+from shapeenh.buffers.tiles import FACES, PAIRS, TILE, draw_tiles, tile_count
 from shapeenh.buffers.windows import (
+    WINDOW,
     edge_functions,
     merge,
     merge_pixels,
+    move_window,
     nearness_plane,
     pixel_keys,
+    window_box,
     window_keys,
-    window_origin,
 )
-from shapeenh.buffers.xla import take
+from shapeenh.buffers.xla import lower_bound, take
 from shapeenh.fusion import stored, unknown_truth
 from shapeenh.types import Camera, Mesh, Visibility
 
@@ -129,7 +131,7 @@ def draw(vertices, faces, m, near, height, width, cull, cells, side):
             xyr, index, even = stored(always, fetch, face)
             there = jnp.minimum(total - first_rank, chunk)
             # one loop per class, of which all but one take no step: unlike a conditional, a loop updates in place
-            sizes = [jnp.where(row == k, there, 0) for k in range(len(WINDOWS) + 1)]
+            sizes = [jnp.where(row == k, there, 0) for k in range(LARGE)]
             keys = draw_windows(always, keys, face, xyr, rank < total, shift, sizes[:-1], height, width)
 
             part = max(1, min(chunk // 2, FACES, (2**31 - 1) // tile_count(height, width)))  # so that counts fit int32
@@ -159,24 +161,55 @@ def draw_windows(always, keys, face, xyr, valid, shift, sizes, height, width):
     stride = width + BORDER
 
     def setup(xyr, valid):
-        origin = jnp.stack(window_origin(xyr[0], xyr[1], height, width))
-        x, y = xyr[0] - (origin[0] << SUB)[None], xyr[1] - (origin[1] << SUB)[None]
+        x0, y0, columns, rows = window_box(xyr[0], xyr[1], height, width)
+        x, y = xyr[0] - (x0 << SUB)[None], xyr[1] - (y0 << SUB)[None]
         edges = edge_functions(x, y, valid).reshape(9, -1).astype(jnp.float32)
-        return jnp.concatenate([edges, nearness_plane(x, y, nearness(xyr[2]) - shift)]), origin[1] * stride + origin[0]
+        planes = jnp.concatenate([edges, nearness_plane(x, y, nearness(xyr[2]) - shift)])
+        return planes, jnp.stack([y0 * stride + x0, columns, rows])
 
-    planes, first = stored(always, setup, xyr, valid)
-    for (rows, columns), size in zip(WINDOWS, sizes, strict=True):
+    planes, box = stored(always, setup, xyr, valid)
+    low = ~face.astype(jnp.uint32)
+    for (rows, columns), size in zip(WINDOWS, sizes[:-1], strict=True):
         part = min(face.shape[0] // 2, SLOTS // (rows * columns))
 
         def draw_part(j, keys, rows=rows, columns=columns, part=part):
-            both, low, start = stored(
-                always, lambda *t: cut(j * part, part, *t), planes, ~face.astype(jnp.uint32), first
-            )
+            both, name, start = stored(always, lambda *t: cut(j * part, part, *t), planes, low, box[0])
             edges, plane = both[:9].reshape(3, 3, -1), both[9:]
             if rows * columns > 4:
-                return merge(keys, window_keys(edges, plane, low, rows, columns), start, stride)
-            new = stored(always, lambda e, p, low: pixel_keys(e, p, low, rows, columns), edges, plane, low)
+                return merge(keys, window_keys(edges, plane, name, rows, columns), start, stride)
+            new = stored(always, lambda e, p, name: pixel_keys(e, p, name, rows, columns), edges, plane, name)
             return merge_pixels(keys, new, start, stride, columns)
 
         keys = lax.fori_loop(jnp.int32(0), (size + (part - 1)) // part, draw_part, keys)
-    return keys
+    return draw_medium(always, keys, planes, low, box, sizes[-1], stride)
+
+
+def draw_medium(always, keys, planes, low, box, size, stride):
+    """The first `size` of the faces, window by window of WINDOW x WINDOW pixels: as many as their boxes need."""
+    n = planes.shape[1]
+    windows = jnp.where(lax.iota(jnp.int32, n) < size, box[1] * box[2], 0)
+    ends = jnp.cumsum(windows, dtype=jnp.int32)
+    total = ends[-1]
+    rows = planes.T
+
+    def step(j, keys):
+        def shifted(rows, low, ends, windows, box):
+            pair = j * PAIRS + lax.iota(jnp.int32, PAIRS)
+            there = pair < total
+            at = lower_bound(ends, 0, n, jnp.minimum(pair, total - 1))
+            start, columns = take(box[0], at), take(box[1], at)
+            number = jnp.minimum(pair, total - 1) - (take(ends, at) - take(windows, at))
+            row = number // columns
+            return there, take(rows, at), take(low, at), start, number - row * columns, row
+
+        there, local, name, start, column, row = stored(always, shifted, rows, low, ends, windows, box)
+
+        def moved(there, local, column, row):
+            return move_window(local.T, column * WINDOW, row * WINDOW, there)
+
+        edges, plane = stored(always, moved, there, local, column, row)
+        return merge(
+            keys, window_keys(edges, plane, name, WINDOW, WINDOW), start + (row * stride + column) * WINDOW, stride
+        )
+
+    return lax.fori_loop(jnp.int32(0), (total + (PAIRS - 1)) // PAIRS, step, keys)

@@ -13,6 +13,7 @@ from jax import lax
 from shapeenh.buffers.project import ONE, SUB, double_area, pixel_box, three, top_left
 
 FROM, TO = np.array([1, 2, 0]), np.array([2, 0, 1])  # the edge opposite to corner 0, 1, 2
+WINDOW = 8  # pixels each way, of faces that need more than one window
 NEVER = np.int32(-(1 << 30))  # an edge function that no pixel of a window makes positive
 
 
@@ -25,9 +26,21 @@ def pack(hit, r, low):
     return wide | lax.convert_element_type(low, jnp.uint64)
 
 
-def window_origin(x, y, height, width):
-    x0, _, y0, _ = pixel_box(x, y, height, width)
-    return jnp.clip(x0, 0, width - 1), jnp.clip(y0, 0, height - 1)
+def window_box(x, y, height, width):
+    """First pixel column and row of faces, held in the image, and how many windows of WINDOW x WINDOW cover the box."""
+    x0, x1, y0, y1 = pixel_box(x, y, height, width)
+    columns, rows = (x1 - x0) // WINDOW + 1, (y1 - y0) // WINDOW + 1
+    return jnp.clip(x0, 0, width - 1), jnp.clip(y0, 0, height - 1), columns, rows
+
+
+def move_window(planes, dx, dy, there):
+    """Edge functions [3, 3, n] and nearness plane [5, n] from `planes` [14, n], seen from a window that begins dx
+    columns and dy rows further on; nothing is inside where not `there`. Still exact in float32."""
+    dx, dy = lax.convert_element_type(dx, jnp.float32), lax.convert_element_type(dy, jnp.float32)
+    a, b, c = planes[:3], planes[3:6], planes[6:9]
+    c = jnp.where(there[None], a * dx[None] + b * dy[None] + c, np.float32(NEVER))
+    base = planes[9] + planes[10] * dx + planes[11] * dy
+    return jnp.stack([a, b, c]), jnp.concatenate([base[None], planes[10:]])
 
 
 def edge_functions(x, y, valid):
