@@ -176,6 +176,24 @@ def make_line_field(i, p):
     return se.make_line_field(i["height"], i["direction"], mask=i["mask"], silhouette=i["silhouette"], sigma=p["sigma"])
 
 
+@stage
+def apply_texture(i, p):
+    return se.apply_texture(dataclasses.replace(gbuffer(i), uv=i["gradient"]), p["map"]).albedo
+
+
+@functools.partial(stage, kind="image", slow=True)
+def enhance_warped(i, p):
+    warp = se.LightWarp(p["alpha"], p["contrast"])
+    return se.enhance(gbuffer(i), p["lights"], material(p), warp, sigma=p["sigma"], foreshortening=p["f"])
+
+
+@functools.partial(stage, kind="image", slow=True)
+def enhance_scaled(i, p):
+    gamma = jnp.minimum(p["gamma"], 1e9)  # of 1e20 the derivative in the normals itself overflows, and in sigma
+    scaling = se.RadianceScaling(p["invariant"], gamma, gamma, p["anisotropy"])
+    return se.enhance(gbuffer(i), p["lights"], material(p), scaling, sigma=p["sigma"])
+
+
 @functools.partial(stage, kind="image")
 def fit_profile(i, p):
     return se.fit_profile(field(i), samples=5)
@@ -385,6 +403,14 @@ def test_compiled_eager_and_batched_agree_and_repeat(function, kind):
 
 # ------------------------------------------------------------------------------------------- kernels
 
+
+def coverage(i):
+    """Any: four samples that borrow from pixels that may not be there."""
+    seen = (i["mask"][..., None] & (i["noise"] > 0)).astype(jnp.float32)
+    source = jnp.where(seen > 0, jnp.round(8 * i["noise"]), -1).astype(jnp.int8)
+    return se.Coverage(source, jnp.mean(seen, axis=-1))
+
+
 KERNELS = {
     "mean_curvature": lambda i, p: se.mean_curvature(i["hessian"]),
     "gaussian_curvature": lambda i, p: se.gaussian_curvature(i["hessian"]) * 1e-30,
@@ -405,6 +431,13 @@ KERNELS = {
     "tone_map": lambda i, p: se.tone_map(i["image"], white=p["ior"]),
     "auto_exposure": lambda i, p: se.auto_exposure(i["image"], i["mask"]),
     "sample_texture": lambda i, p: se.sample_texture(p["map"], i["hessian"][..., :2]),
+    "composite": lambda i, p: se.composite(i["image"], i["noise"][..., 0], p["diffuse"]),
+    "composite_lines": lambda i, p: se.composite_lines(i["image"], i["noise"]),
+    "resolve_coverage": lambda i, p: se.resolve_coverage(i["image"], coverage(i)),
+    "spherical_harmonics": lambda i, p: se.spherical_harmonics(p["map"]),
+    "prefilter_map": lambda i, p: se.prefilter_map(p["map"], height=4),
+    "sample_environment": lambda i, p: se.sample_environment(p["map"], 5, rotation=p["alpha"]),
+    "rotate_lights": lambda i, p: se.rotate_lights(p["lights"], p["camera"]),
 }
 for _name, _function in KERNELS.items():
     _function.__name__ = _name
@@ -421,84 +454,6 @@ def test_kernels_and_their_gradients_are_finite_for_finite_input(function, draw)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(out))
     for path, leaf in jax.tree_util.tree_leaves_with_path(gradients):
         assert np.all(np.isfinite(leaf)), f"gradient of {jax.tree_util.keystr(path)}"
-
-
-# ------------------------------------------------------------------------------------------- meshes and points
-
-GEOMETRIES = (
-    "torus",
-    "flat",
-    "one point",
-    "huge",
-    "tiny",
-    "behind",
-    "through the eye",
-    "repeated faces",
-    "zero normals",
-)
-
-
-def geometry(kind, seed):
-    """(vertices, faces, normals): a torus, and what may be wrong with it, float32."""
-    rng = np.random.default_rng(seed)
-    mesh = se.torus(segments=4)
-    vertices, faces, normals = (np.array(a) for a in (mesh.vertices, mesh.faces, mesh.normals))
-    vertices += np.float32([0, 0, -3]) + 0.1 * rng.normal(size=vertices.shape).astype(np.float32)
-    if kind == "flat":
-        vertices[:, 1] = 0
-    elif kind == "one point":
-        vertices[:] = vertices[0]
-    elif kind in ("huge", "tiny"):
-        vertices *= np.float32(1e6 if kind == "huge" else 1e-6)
-    elif kind in ("behind", "through the eye"):
-        vertices[:, 2] += np.float32(6 if kind == "behind" else 3)
-    elif kind == "repeated faces":
-        faces[::2] = faces[0]
-        faces[1::4, 1] = faces[1::4, 0]
-    elif kind == "zero normals":
-        normals[::2] = 0
-    return vertices, faces, normals
-
-
-def seen_mesh(i, p):
-    mesh = se.Mesh(i["vertices"], p["faces"], i["normals"])
-    return se.render_gbuffer(mesh, p["camera"], height=SHAPE[0], width=SHAPE[1])
-
-
-def seen_points(i, p):
-    options = {"height": SHAPE[0], "width": SHAPE[1], "tolerance": p["tolerance"]}
-    return se.gbuffer_from_points(i["vertices"], i["normals"], p["radius"], p["camera"], **options)
-
-
-def mesh_tables(i, p):
-    mesh = se.make_mesh(i["vertices"], p["faces"])
-    return mesh.normals, se.vertex_curvature(dataclasses.replace(mesh, normals=i["normals"]))
-
-
-def framed(i, p):
-    camera = se.frame_mesh(se.Mesh(i["vertices"], p["faces"], i["normals"]))
-    return camera.view, camera.projection
-
-
-@pytest.mark.parametrize(
-    "function", [seen_mesh, pytest.param(seen_points, marks=pytest.mark.slow), mesh_tables, framed]
-)
-def test_hostile_geometry_gives_finite_pictures_and_gradients(function):
-    def value(floats, faces, radius, eye):
-        p = {"faces": faces, "camera": eye, "radius": radius, "tolerance": 1.0}
-        out = function(floats, p)
-        leaves = [leaf for leaf in jax.tree.leaves(out) if is_float(leaf)]
-        return sum(jnp.sum(leaf) for leaf in leaves), leaves
-
-    both = jax.jit(jax.value_and_grad(value, argnums=0, has_aux=True))
-    for kind in GEOMETRIES:
-        for seed in range(3):
-            vertices, faces, normals = geometry(kind, seed)
-            radius = np.float32(0.3 * 10.0 ** (seed - 1))
-            (_, leaves), gradients = both({"vertices": vertices, "normals": normals}, faces, radius, camera(np.float32))
-            assert all(np.all(np.isfinite(leaf)) for leaf in leaves), kind
-            assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradients)), kind
-    assert both._cache_size() == 1
 
 
 # ------------------------------------------------------------------------------------------- bad arguments
