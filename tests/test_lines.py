@@ -7,6 +7,7 @@ import pytest
 from scipy import ndimage
 
 import shapeenh as se
+from shapeenh.lines.tiles import list_tiles
 from shapeenh.types import GBuffer, replace
 from tests.reference import lines as reference
 
@@ -275,6 +276,39 @@ def test_directions_are_smoothed_as_lines(rng):
     middle = np.asarray(a.direction)[8:-8, 8:-8]
     assert np.max(np.abs(np.arctan2(middle[..., 1], middle[..., 0]) - 0.5)) < 0.3
     np.testing.assert_allclose(np.linalg.norm(a.direction, axis=-1), 1, atol=1e-5)
+
+
+# ------------------------------------------------------------------------------------------- only where something is
+
+
+@pytest.mark.parametrize(("corner", "centre"), [((70, 93), (44, 40)), ((0, 0), (15, 12)), ((152, 240), (70, 75))])
+@pytest.mark.parametrize("kind", ["valley", pytest.param("occlusion", marks=pytest.mark.slow)])
+def test_a_small_object_in_a_large_frame_has_the_lines_of_the_frame_cut_to_it(kind, corner, centre):
+    """Tiles give what the cut frame gives as a whole, also where the image ends in the middle of the object."""
+    n, shape = 88, (240, 328)
+    row, col = np.mgrid[0:n, 0:n].astype(float) - np.reshape(centre, (2, 1, 1))
+    radius = np.hypot(row, col)
+    z = np.where(radius < 24, 4 * np.cos(radius / 3) + np.sin(col / 3) + 9 * (col > row), np.nan)
+    small = se.gbuffer_from_height(jnp.asarray(z, jnp.float32))
+    place = [(c, size - n - c) for c, size in zip(corner, shape, strict=True)]
+    small = small, se.describe(small)
+    large = jax.tree.map(lambda a: jnp.pad(a, [*place, *[(0, 0)] * (a.ndim - 2)]), small)
+    assert list_tiles(large[0].mask, 8) is not None
+    assert list_tiles(small[0].mask, 8) is None
+    cut, found = np.s_[corner[0] : corner[0] + n, corner[1] : corner[1] + n], []
+    for gbuffer, descriptor in (small, large):
+        field = se.line_field(kind, gbuffer, descriptor)
+        profile = se.fit_profile(field, radius=3.0, least=0.02)
+        sheets = {} if kind == "occlusion" else {"gbuffer": gbuffer, "descriptor": descriptor}
+        strokes = se.draw_lines(profile, field, se.Brush(low=0.02, high=0.1), **sheets)
+        found.append(jax.tree.leaves((field, profile, strokes)))
+    assert np.any(np.asarray(strokes)[..., 3] > 0.5)
+    for k, (ours, whole) in enumerate(zip(found[1], found[0], strict=True)):
+        near = 1e-6 if k < 3 else 1e-3  # places of samples are rounded, more so far from the first pixel
+        np.testing.assert_allclose(np.asarray(ours, float)[cut], np.asarray(whole, float), atol=near)
+        around = np.ones(shape, bool)
+        around[cut] = False
+        assert len(np.unique(np.asarray(ours)[around])) == 1
 
 
 # ------------------------------------------------------------------------------------------- gradients, edge cases

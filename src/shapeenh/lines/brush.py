@@ -17,7 +17,7 @@ import numpy as np
 from jax.tree_util import register_dataclass
 
 from shapeenh.checks import check_range, check_shape, check_size, check_type, float_dtype, is_concrete
-from shapeenh.lines.accumulate import draw_everywhere, draw_listed, list_runs
+from shapeenh.lines.accumulate import crossings_on_host, draw_everywhere, draw_listed, list_runs
 from shapeenh.lines.fields import depth_barriers
 from shapeenh.lines.noise import CHANNELS
 from shapeenh.lines.stamps import FOOTPRINTS, stamps_of
@@ -127,8 +127,10 @@ def draw_lines(
     if not concrete:
         return draw_everywhere(profile, field, brush, shading, noise, image, barriers, **options)
     stamps = stamps_of(profile, field, brush, shading, noise, **wants)
+    barriers = None if barriers is None else tuple(map(np.asarray, barriers))
     listed, counts = list_runs(stamps.weight, barriers, reach)
-    return draw_listed(stamps, listed, counts, brush, noise, image, barriers, **options)
+    crossed = None if barriers is None else crossings_on_host(*barriers)
+    return draw_listed(stamps, listed, counts, brush, noise, image, crossed, **options)
 
 
 def _wants(brush, shading, noise, function) -> dict[str, bool]:
@@ -144,7 +146,7 @@ def _wants(brush, shading, noise, function) -> dict[str, bool]:
 
 
 def _barriers(gbuffer, descriptor, shape):
-    """Where footprints end, between the pixels; or None."""
+    """Where footprints end, between a pixel and the next one to the right or below; or None."""
     if gbuffer is None and descriptor is None:
         return None
     check_type("gbuffer", gbuffer, GBuffer)

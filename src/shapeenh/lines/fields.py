@@ -1,8 +1,4 @@
-"""Height and direction fields whose ridges are feature lines (TH10 7.1 and 7.2.1, table of SPEC 9).
-
-A direction is a line, not an arrow, and is carried as an arrow of twice its angle, (cos 2 phi, sin 2 phi), which is the
-same for theta and -theta: that may be averaged. With the weight |h| it is the traceless part of h theta theta^T.
-"""
+"""Height and direction fields whose ridges are feature lines (TH10 table 7.1, table of SPEC 9)."""
 
 from __future__ import annotations
 
@@ -14,14 +10,14 @@ import numpy as np
 from jax import lax
 
 from shapeenh.checks import check_choice, check_range, check_shape, check_type, float_dtype, is_concrete
-from shapeenh.fusion import stored, unknown_truth
-from shapeenh.heat import explicit
-from shapeenh.numerics import safe_divide, safe_hypot, safe_sqrt, smoothstep
+from shapeenh.fusion import unknown_truth
+from shapeenh.lines.smoothing import LEAST_HEIGHT, prepare, smoothed_field
+from shapeenh.lines.tiles import list_tiles, over_tiles
+from shapeenh.numerics import safe_divide, safe_hypot, smoothstep
 from shapeenh.stencils import derivatives, links, shift
 from shapeenh.types import Descriptor, GBuffer, LineField
 
 KINDS = ("occlusion", "surface", "luminance", "ridge", "valley", "inflection")
-LEAST_HEIGHT = 1e-5  # slopes and curvatures per px below this are rounding, not shape: no direction there
 GREATEST_SIGMA = 20.0
 _STEP_SIGMA = 1.5  # px
 
@@ -55,7 +51,7 @@ def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=1.0) -> 
     Returns: LineField [H, W]; 0 off the mask with singularity 1 there, except occlusion lines, which straddle the
         outline and extend a few pixels beyond it.
     Gradient: with respect to descriptor.hessian, descriptor.gradient, luminance, sigma, where the height is not 0; none
-        through silhouettes.
+        through silhouettes. In reverse mode alone: forward mode (jax.jvp, jax.jacfwd) raises a TypeError.
     Errors: ValueError for an unknown kind, for shapes that disagree, and for a missing or superfluous luminance.
 
     >>> field = se.line_field("valley", gbuffer, se.describe(gbuffer, sigma=2.0))
@@ -81,7 +77,10 @@ def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=1.0) -> 
         if luminance is not None:
             check_shape("luminance", luminance, (h, w))
         dtype = float_dtype(descriptor.hessian)
-    return _assemble(_measure, gbuffer, descriptor, luminance, jnp.asarray(sigma, dtype), kind=kind)
+    flags = None if gbuffer is None else gbuffer.mask
+    spread = _STEP_SIGMA if kind == "occlusion" else 0.0
+    images = gbuffer, descriptor, luminance
+    return smoothed_field(_measure, images, jnp.asarray(sigma, dtype), flags, spread=spread, kind=kind)
 
 
 def make_line_field(height, direction, *, mask=None, silhouette=None, sigma=0.0) -> LineField:
@@ -95,7 +94,7 @@ def make_line_field(height, direction, *, mask=None, silhouette=None, sigma=0.0)
         sigma: [], px, in [0, 20], as in `line_field`.
 
     Static: which arguments are None.
-    Returns: LineField [H, W]. Gradient: with respect to height, direction and sigma.
+    Returns: LineField [H, W]. Gradient: with respect to height, direction and sigma, in reverse mode alone.
     Errors: ValueError for shapes that disagree and numbers out of range.
     """
     check_shape("height", height, (None, None))
@@ -109,12 +108,12 @@ def make_line_field(height, direction, *, mask=None, silhouette=None, sigma=0.0)
     height, direction = jnp.asarray(height, dtype), jnp.asarray(direction, dtype)
     mask = jnp.ones(shape, bool) if mask is None else jnp.asarray(mask) != 0
     silhouette = jnp.zeros(shape, dtype) if silhouette is None else jnp.asarray(silhouette, dtype)
-    return _assemble(_take, height, direction, mask, silhouette, jnp.asarray(sigma, dtype))
+    return smoothed_field(_take, (height, direction, mask, silhouette), jnp.asarray(sigma, dtype), mask)
 
 
 @partial(jax.jit, static_argnames=("kind",))
 def _measure(gbuffer, descriptor, luminance, sigma, *, kind):
-    """What the table says, as `_prepare` returns it."""
+    """What the table says, as `prepare` returns it."""
     always = unknown_truth(sigma, *jax.tree.leaves((gbuffer, descriptor, luminance)))
     if gbuffer is None:
         good, silhouette = jnp.isfinite(luminance), jnp.zeros_like(luminance)
@@ -131,18 +130,18 @@ def _measure(gbuffer, descriptor, luminance, sigma, *, kind):
         g = _gradient(descriptor, luminance, good, silhouette, kind, always)
         height, double = safe_hypot(*g), _doubled(*g)
     flat = jnp.abs(height) <= LEAST_HEIGHT
-    return _prepare(height, double, good, flat, silhouette, sigma)
+    return prepare(height, double, good, flat, silhouette, sigma)
 
 
 @jax.jit
 def _take(height, direction, mask, silhouette, sigma):
-    """A caller's own field, as `_prepare` returns it."""
+    """A caller's own field, as `prepare` returns it."""
     good = mask & jnp.isfinite(height) & jnp.all(jnp.isfinite(direction), axis=-1)
     x, y = (jnp.where(good, direction[..., i], 0) for i in (0, 1))
     length = safe_hypot(x, y)
     double = _doubled(safe_divide(x, length), safe_divide(y, length))
     none = jnp.zeros_like(good)
-    return _prepare(jnp.where(good, height, 0), double, good, none, jnp.clip(silhouette, 0, 1), sigma)
+    return prepare(jnp.where(good, height, 0), double, good, none, jnp.clip(silhouette, 0, 1), sigma)
 
 
 # ------------------------------------------------------------------------------------------- table 7.1
@@ -189,7 +188,7 @@ def _gradient(descriptor, luminance, good, silhouette, kind, always):
 def _occlusion(gbuffer, silhouette):
     """|g_d| and its direction, with every step of depth normalised to 1 and slopes taken off."""
     planes = []
-    for axis, step in enumerate(_depth_steps(gbuffer, silhouette)):
+    for axis, step in enumerate(_depth_steps(gbuffer.mask, gbuffer.depth, silhouette)):
         before, after = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
         before[axis], after[axis] = (1, 0), (0, 1)
         half = 0.5 * (jnp.pad(step, before) + jnp.pad(step, after))
@@ -199,14 +198,13 @@ def _occlusion(gbuffer, silhouette):
     return safe_hypot(g_x, g_y), _doubled(g_x, g_y)
 
 
-def _depth_steps(gbuffer, silhouette):
+def _depth_steps(mask, depth, silhouette):
     """[down the columns [H-1, W], along the rows [H, W-1]]: the step between neighbours, in [-1, 1], positive where the
     second one is farther.
 
     The descriptor marks the far side of a step with a weight; which of its neighbours it is far *of* is read off the
     depth. Off the mask everything is far.
     """
-    depth, mask = gbuffer.depth, gbuffer.mask
     depth = jnp.where(mask & jnp.isfinite(depth), depth, 0)
 
     def pair(image, axis):
@@ -239,99 +237,27 @@ def _depth_steps(gbuffer, silhouette):
     return found
 
 
-@jax.jit
 def depth_barriers(gbuffer, descriptor):
-    """(along the rows [H, W-1], down the columns [H-1, W]) bool: between which neighbours there is a step of depth or
-    the outline. No gradient."""
-    silhouette = jnp.where(gbuffer.mask & jnp.isfinite(descriptor.silhouette), descriptor.silhouette, 0)
-    down, along = _depth_steps(gbuffer, silhouette)
-    return jnp.abs(along) > 0.5, jnp.abs(down) > 0.5
+    """(across, down), [H, W] bool: whether between a pixel and the one to its right, or below, there is a step of depth
+    or the outline. No gradient."""
+    surface = gbuffer.mask, gbuffer.depth, descriptor.silhouette
+    if is_concrete(surface):
+        tiles = list_tiles(gbuffer.mask, _MARGIN, around=1)
+        if tiles is not None:
+            return _tiled_barriers(surface, tiles)
+    return _barriers(surface)
 
 
-# ------------------------------------------------------------------------------------------- smoothing, singularities
-
-
-def _assemble(first, *arguments, **options) -> LineField:
-    """What `first` measures, diffused, with directions from doubled angles, and its singularities.
-
-    Called directly, these are separate compiled functions, plane by plane: together they need more memory than a cache
-    holds and than an allocator keeps (twice as slow). Under somebody's jit, borders of fusion stand for them.
-    """
-    if is_concrete(arguments):
-        call = lambda function, *values, **options: function(*values, **options)  # noqa: E731
-    else:
-        always = unknown_truth(*jax.tree.leaves(arguments))
-        call = lambda function, *values, **options: stored(always, partial(function, **options), *values)  # noqa: E731
-    planes, (link_x, link_y), time, known = call(first, *arguments, **options)
-    if not (is_concrete(time) and float(time[0, 0]) == 0):
-        planes = [call(_diffused, plane, link_x, link_y, time) for plane in planes]
-    height, direction, around, flags = call(_directions, planes, known, time)
-    return LineField(height, direction, call(_singularity, around, *flags))
-
-
-def _prepare(height, double, good, flat, silhouette, sigma):
-    """(the planes to be diffused, their links, the time, what is known before it)."""
-    height = jnp.where(good, height, 0)
-    double = jnp.where((good & ~flat)[None], double, 0)
-    weight = jnp.abs(height)
-    planes = [plane[None] for plane in (height, weight * double[0], weight * double[1])]
-    insulated = links(lax.stop_gradient(jnp.where(good, 1 - silhouette, 0)))
-    return planes, insulated, (0.5 * sigma * sigma)[None, None], (double, good, flat, silhouette)
+_MARGIN = 8
 
 
 @jax.jit
-def _diffused(plane, link_x, link_y, time):
-    return explicit(plane, link_x, link_y, time, jnp.ones_like(time))
+def _tiled_barriers(surface, tiles):
+    return over_tiles(_barriers, surface, tiles, (False, False), margin=_MARGIN)
 
 
 @jax.jit
-def _directions(planes, known, time):
-    """(height, direction, [3, H+2, W+2] for `_singularity`, what else it needs)."""
-    double, good, flat, silhouette = known
-    # without diffusion the directions are the given ones, also where the height is 0
-    smooth = time[0, 0] > 0
-    double = jnp.where(smooth, jnp.concatenate(planes[1:]), double)
-    height = jnp.where(good, planes[0][0], 0)
-    theta, defined = _halved(double, jnp.where(smooth, 1e-3 * jnp.abs(height), 0.5))
-    flat &= jnp.abs(height) <= LEAST_HEIGHT
-    theta = jnp.where((good & ~flat)[None], theta, 0)
-    weight = jnp.where(good & ~flat, 1 - silhouette, 0)
-    around = jnp.pad(jnp.concatenate([theta, weight[None]]), ((0, 0), (1, 1), (1, 1)))
-    return height, jnp.moveaxis(around[:2, 1:-1, 1:-1], 0, -1), around, (good, flat, defined, silhouette)
-
-
-@jax.jit
-def _singularity(around, good, flat, defined, silhouette):
-    gamma = jnp.maximum(_angular(around), silhouette)
-    return jnp.where(good, jnp.where(flat, silhouette, jnp.where(defined, gamma, 1)), 1)
-
-
-def _halved(double, least):
-    """(unit direction [2, H, W] of half the angle, whether it is defined); 0 where |double| <= least."""
-    length = safe_hypot(double[0], double[1])
-    defined = length > least
-    c, s = (safe_divide(jnp.where(defined, d, 0), jnp.where(defined, length, 1)) for d in double)
-    # (1 + c, s) or (s, 1 - c), whichever does not vanish
-    right = c >= 0
-    big = safe_sqrt(0.5 * (1 + jnp.where(right, c, -c)))
-    small = 0.5 * s / big
-    x, y = jnp.where(right, big, small), jnp.where(right, small, big)
-    return jnp.where(defined[None], jnp.stack([x, y]), 0), defined
-
-
-def _angular(around):
-    """gamma_theta = 1 - mean over 8 neighbours |theta . theta_i| (TH10 7.2.1).
-
-    around: [3, H+2, W+2], theta and the weight of a pixel, 0 in the ring. The mean is over those neighbours on the same
-    surface that are not flat: what lies across a silhouette or has no relief says nothing about directions here.
-    Without any it is 1.
-    """
-    h, w = around.shape[1] - 2, around.shape[2] - 2
-    at = lambda dr, dc: around[:, 1 + dr : 1 + dr + h, 1 + dc : 1 + dc + w]  # noqa: E731
-    here = at(0, 0)
-    total, cosines = jnp.zeros_like(here[2]), jnp.zeros_like(here[2])
-    for dr, dc in ((r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)):
-        x, y, weight = at(dr, dc)
-        total += weight
-        cosines += weight * jnp.abs(here[0] * x + here[1] * y)
-    return jnp.clip(1 - safe_divide(cosines, total), 0, 1)
+def _barriers(surface):
+    mask, depth, silhouette = surface
+    down, across = _depth_steps(mask, depth, jnp.where(mask & jnp.isfinite(silhouette), silhouette, 0))
+    return jnp.pad(jnp.abs(across) > 0.5, ((0, 0), (0, 1))), jnp.pad(jnp.abs(down) > 0.5, ((0, 1), (0, 0)))

@@ -16,6 +16,7 @@ from jax import lax
 
 from shapeenh.checks import check_choice, check_range, check_shape, check_size, check_type, float_dtype, is_concrete
 from shapeenh.fusion import stored, unknown_truth
+from shapeenh.lines.tiles import list_tiles, margin_for, over_tiles
 from shapeenh.numerics import normalize, smoothstep
 from shapeenh.types import LineField, Profile
 
@@ -70,16 +71,48 @@ def fit_profile(field, *, radius: float = 4.0, samples: int = 9, least=0.0) -> P
         raise ValueError(f"field.height has shape {(h, w)}; accepted are images of at least one pixel")
     if not is_concrete(field, least):
         return _fit_everywhere(field, least, **options)
-    planes = _stored_planes(field)
-    listed, counts = _list(*map(np.asarray, _candidates(planes, least, radius=float(radius))))
+    planes, candidates = _looked_at(field, least, float(radius))
+    listed, counts = _list(*map(np.asarray, candidates))
     return _fit_listed(planes, listed, counts, least, **options)
+
+
+def _looked_at(field, least, radius):
+    """(what `_planes` and what `_candidates` returns), worked out only near heights that a line can come from."""
+    reach = int(np.ceil(radius)) + 1  # px, how far a fit reads
+    margin = margin_for(reach + 3)
+    tiles = None if margin is None else list_tiles(_high(field, least), margin, around=2 * reach + 3)
+    if tiles is None:
+        planes = _stored_planes(field)
+        return planes, _candidates(planes, least, radius=radius)
+    *planes, possible, held = _tiled(field, least, tiles, margin=margin, radius=radius)
+    return tuple(planes), (possible, held)
+
+
+@jax.jit
+def _high(field, least):
+    """Where a height may make a profile higher than `least`, [H, W] bool.
+
+    Where all are within ±m, those that are extrapolated from them are within ±3 m, and a cubic over both below 5 m.
+    """
+    return (field.singularity < 1) & ((jnp.abs(field.height) > 0.2 * least) | (least <= 0))
+
+
+@partial(jax.jit, static_argnames=("margin", "radius"))
+def _tiled(field, least, tiles, *, margin, radius):
+    def look(field):
+        planes = _planes(field)
+        return *planes, *_candidates(planes, least, radius=radius)
+
+    return over_tiles(look, field, tiles, (0, 1, 0, 0, False, False), margin=margin)
 
 
 def _list(candidates, held):
     """(pixels [n] int32, chunks [2] int32): first those that no singularity is near, then the others."""
     size = candidates.size
     listed = np.full(_CHUNK * (size // _CHUNK + 3), size, np.int32)  # one length per image: nothing recompiles
-    free, near = np.flatnonzero(candidates & ~held), np.flatnonzero(candidates & held)
+    found = np.flatnonzero(candidates)
+    held = held.ravel()[found]
+    free, near = found[~held], found[held]
     listed[: free.size] = free
     start = -(-free.size // _CHUNK)
     listed[start * _CHUNK : start * _CHUNK + near.size] = near

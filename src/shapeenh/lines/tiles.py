@@ -1,0 +1,97 @@
+"""Work only where something is: tiles that cover the flagged pixels of an image, each read with a margin around it.
+
+Stencils follow one another within a tile while it is in the cache. The sizes of tiles are compiled in, their places and
+their number are not: the cost follows the covered pixels, and nothing recompiles when they move. Imports nothing of
+ours.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+TILE = (96, 128)  # with a margin of 16 its planes take 80 KiB each
+_MARGINS = (8, 12, 16, 24, 32, 40)
+_WORTH = 1.25  # from this many times the image's pixels on, margins included, tiles cost more than the image
+
+
+def margin_for(reach: int) -> int | None:
+    """A margin of at least `reach` pixels, one of few, since it is compiled in; None: too wide for tiles."""
+    return next((m for m in _MARGINS if m >= reach), None)
+
+
+def list_tiles(flags, margin: int | None, *, around: int = 0):
+    """(corners [n, 2] int32, how many [] int32) of tiles that hold every pixel within `around` of a flagged one.
+
+    flags: [H, W] bool, concrete; or None for all. None where tiles would not pay: then the whole image is to be taken.
+    """
+    if flags is None or margin is None:
+        return None
+    flags = np.asarray(flags)
+    size = flags.shape
+    if any(n < t + 2 * margin for n, t in zip(size, TILE, strict=True)):
+        return None
+    found = []
+    for row in _starts(_wider(flags.any(axis=1), around), TILE[0]):
+        band = flags[max(row - around, 0) : row + TILE[0] + around]
+        found += [(row, col) for col in _starts(_wider(band.any(axis=0), around), TILE[1])]
+    if len(found) * (TILE[0] + 2 * margin) * (TILE[1] + 2 * margin) > _WORTH * flags.size:
+        return None
+    most = -(-size[0] // TILE[0]) * -(-size[1] // TILE[1])
+    corners = np.zeros((most, 2), np.int32)  # one length per image: nothing recompiles
+    corners[: len(found)] = np.reshape(found, (-1, 2))
+    return jnp.asarray(corners), jnp.asarray(len(found), jnp.int32)
+
+
+def _wider(line: np.ndarray, by: int) -> np.ndarray:
+    """The flags of a line, and `by` places on either side of each."""
+    total = np.cumsum(np.pad(line, (by + 1, by)))
+    return total[2 * by + 1 :] > total[: -2 * by - 1]
+
+
+def _starts(line: np.ndarray, length: int) -> list[int]:
+    """Where pieces of this length begin that hold all flags of a line: each at the first flag that none holds yet."""
+    found, places = [], np.flatnonzero(line)
+    while places.size:
+        start = min(int(places[0]), line.size - length)
+        found.append(start)
+        places = places[np.searchsorted(places, start + length) :]
+    return found
+
+
+def over_tiles(function, images, tiles, background, *, margin: int):
+    """`function(images)` in the tiles, and the values of `background` elsewhere.
+
+    function: a tree of images [h, w, ...] to a tuple of such, or of such with one more pixel all around, whose values
+        depend on those up to `margin` px away and on whether the image ends there: windows keep within the image, so
+        that its border stays a border.
+    """
+    corners, count = tiles
+    shape = np.asarray(jax.tree.leaves(images)[0].shape[:2])
+    size = np.asarray(TILE) + 2 * margin
+
+    def cut(image, start, size):
+        rest = image.ndim - 2
+        return lax.dynamic_slice(image, (*start, *(0,) * rest), (*map(int, size), *image.shape[2:]))
+
+    def one(k, out):
+        corner = [corners[k, i] for i in (0, 1)]
+        start = [jnp.clip(corner[i] - margin, 0, int(shape[i] - size[i])) for i in (0, 1)]
+        inner = [corner[i] - start[i] for i in (0, 1)]
+        found = function(jax.tree.map(lambda image: cut(image, start, size), images))
+        return tuple(
+            lax.dynamic_update_slice(
+                whole, cut(part, inner, part.shape[:2] - size + TILE), (*corner, *(0,) * (part.ndim - 2))
+            )
+            for whole, part in zip(out, found, strict=True)
+        )
+
+    part = jax.tree.map(lambda image: jax.ShapeDtypeStruct((*size, *image.shape[2:]), image.dtype), images)
+    shapes = jax.eval_shape(function, part)
+    out = tuple(
+        jnp.full((*(shape + s.shape[:2] - size), *s.shape[2:]), b, s.dtype)
+        for s, b in zip(shapes, background, strict=True)
+    )
+    return lax.fori_loop(0, count, one, out)
