@@ -190,6 +190,44 @@ def test_noise_interrupts_takes_off_and_moves():
     np.testing.assert_allclose(moved[5:-8, 8:-8], plain[8:-5, 8:-8], atol=1e-5)
 
 
+def test_noise_turns_and_resizes_footprints():
+    """TH10 fig. 8.4: orientation as a field whose directions are turned, size as a smaller brush."""
+    profile, field = straight(angle=0.3)
+    x, y = field.direction[..., 0], field.direction[..., 1]
+    cos, sin = np.cos(0.6), np.sin(0.6)
+    turned = replace(field, direction=jnp.stack([cos * x - sin * y, sin * x + cos * y], -1))
+    brush = se.Brush(radius=3.0, aspect=0.4, flow=1.0)
+    plain, expected = (np.asarray(se.draw_lines(profile, f, brush, footprint="ellipse")) for f in (field, turned))
+    twisted = replace(brush, twist=0.6)
+    got = se.draw_lines(profile, field, twisted, footprint="ellipse", noise=noise_image(1.0))
+    np.testing.assert_allclose(got, expected, atol=1e-5)
+    assert np.max(np.abs(plain - expected)) > 0.05
+    got = se.draw_lines(profile, field, twisted, footprint="ellipse", noise=noise_image(0.5))
+    np.testing.assert_allclose(got, plain, atol=1e-5)
+    smaller = se.draw_lines(profile, field, se.Brush(radius=3.0, uneven=0.5), noise=noise_image(0.8))
+    np.testing.assert_allclose(smaller, se.draw_lines(profile, field, se.Brush(radius=1.8)), atol=1e-5)
+
+
+def test_colours_may_be_any_sequence_of_three():
+    profile, field = straight()
+    noise, shading = noise_image(), jnp.full((SIZE, SIZE, 3), 0.5)
+    for strengths in ({}, {"tint": 0.5}, {"shade": 0.5}):
+        draw = lambda color, s=strengths: se.draw_lines(  # noqa: E731
+            profile, field, se.Brush(color=color, **s), noise=noise, shading=shading
+        )
+        for color in ([1, 0, 0], np.array([1.0, 0.0, 0.0]), jnp.array([1, 0, 0])):
+            np.testing.assert_array_equal(draw(color), draw((1.0, 0.0, 0.0)))
+    for name, value in (
+        ("color", [1, 0]),
+        ("color", "red"),
+        ("color", ["a", "b", "c"]),
+        ("radius", [1.5]),
+        ("flow", None),
+    ):
+        with pytest.raises(ValueError, match=rf"brush\.{name} "):
+            se.draw_lines(profile, field, se.Brush(**{name: value}))
+
+
 def test_composition_is_the_over_operator():
     picture = jnp.full((2, 2, 3), 0.5)
     strokes = jnp.broadcast_to(jnp.asarray([0.1, 0.0, 0.2, 0.25]), (2, 2, 4))

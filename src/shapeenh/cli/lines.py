@@ -14,7 +14,7 @@ from shapeenh.cli import frames, render, scene, values
 from shapeenh.cli.terminal import Stopwatch
 from shapeenh.cli.values import UsageError
 from shapeenh.light.radiance import shade
-from shapeenh.lines.brush import composite_lines, draw_lines
+from shapeenh.lines.brush import NOISY, composite_lines, draw_lines
 from shapeenh.lines.fields import KINDS, line_field, make_line_field
 from shapeenh.lines.noise import surface_noise
 from shapeenh.lines.profile import fit_profile
@@ -136,7 +136,7 @@ def object_lines(gbuffer, descriptor, picture, camera, arguments, kinds):
     """
     height, width = gbuffer.mask.shape
     noise = None
-    if _wants(arguments, "paper", "gaps", "tint", "wobble"):
+    if _wants(arguments, *NOISY):
         noise = surface_noise(gbuffer, camera, size=max(4.0 * height / pipeline.REFERENCE_HEIGHT, 1.0))
     strokes = jnp.zeros((height, width, 4), descriptor.hessian.dtype)
     for kind in kinds:
@@ -212,7 +212,7 @@ def frame_lines(picture, arguments) -> np.ndarray:
     linear = jnp.asarray(codecs.srgb_decode(picture), jnp.float32)
     if arguments.over != "transparent":
         below = linear if arguments.over == "shading" else jnp.broadcast_to(jnp.asarray(PAPER), linear.shape)
-    noise = paper_noise(height, width) if _wants(arguments, "paper", "gaps", "tint", "wobble") else None
+    noise = paper_noise(height, width) if _wants(arguments, *NOISY) else None
     footprint = style_footprint(arguments.style)
     return _over(draw_lines(profile, field, brush, footprint=footprint, shading=linear, noise=noise), below)
 

@@ -24,6 +24,7 @@ from shapeenh.lines.stamps import FOOTPRINTS, stamps_of
 from shapeenh.types import Descriptor, GBuffer, LineField, Profile
 
 LARGEST_REACH = 64
+NOISY = ("paper", "gaps", "tint", "wobble", "uneven", "twist")  # what of a brush needs noise
 _LADDER = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, 32, 48, 64)
 
 
@@ -45,9 +46,12 @@ class Brush:
     shade: [], in [0, 1], how much of the colour comes from the shading at the skeleton.
     paper, gaps, tint: [], in [0, 1], how much noise takes off the picture, interrupts the line, varies the colour.
     wobble: [], px, how far noise moves a stamp.
+    uneven: [], in [0, 1], how much noise takes off the footprint's size; the same noise as that of the gaps, so that a
+        line grows thin before it ends.
+    twist: [], rad, in [0, pi], how far noise turns the footprint; the same noise as that of the tint.
     """
 
-    color: jax.Array | tuple = (0.0, 0.0, 0.0)
+    color: jax.Array | tuple | list = (0.0, 0.0, 0.0)
     flow: jax.Array | float = 3.0
     radius: jax.Array | float = 1.5
     aspect: jax.Array | float = 1.0
@@ -62,6 +66,8 @@ class Brush:
     gaps: jax.Array | float = 0.0
     tint: jax.Array | float = 0.0
     wobble: jax.Array | float = 0.0
+    uneven: jax.Array | float = 0.0
+    twist: jax.Array | float = 0.0
 
 
 def draw_lines(
@@ -122,7 +128,7 @@ def draw_lines(
     reach = _reach(brush, reach, corners=function not in FOOTPRINTS)
     concrete = is_concrete(profile, field, brush, shading, noise, image, barriers)
     wants = _wants(brush, shading, noise, function) if concrete else {}
-    brush = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), brush, is_leaf=lambda leaf: isinstance(leaf, tuple))
+    brush = Brush(**{name: jnp.asarray(value, dtype) for name, value in vars(brush).items()})
     options = {"function": function, "reach": reach}
     if not concrete:
         return draw_everywhere(profile, field, brush, shading, noise, image, barriers, **options)
@@ -141,7 +147,7 @@ def _wants(brush, shading, noise, function) -> dict[str, bool]:
         "colored": shaded or tinted,
         "turned": function != "disc",
         "moved": moved,
-        "grown": float(brush.grow) > 0 or float(brush.swell) > 0,
+        "grown": float(brush.grow) > 0 or float(brush.swell) > 0 or (noise is not None and float(brush.uneven) > 0),
     }
 
 
@@ -174,12 +180,14 @@ def _check_brush(brush, shading, noise) -> None:
         ("gaps", 0, 1, False),
         ("tint", 0, 1, False),
         ("wobble", 0, 32, False),
+        ("uneven", 0, 1, False),
+        ("twist", 0, np.pi, False),
     ):
         check_shape(f"brush.{name}", getattr(brush, name), ())
         check_range(f"brush.{name}", getattr(brush, name), low, high, open_ends=ends)
     if is_concrete(brush.low, brush.high) and not float(brush.low) < float(brush.high):
         raise ValueError(f"brush.low is {brush.low} and brush.high {brush.high}; accepted is low < high")
-    for names, image, what in ((("shade",), shading, "shading"), (("paper", "gaps", "tint", "wobble"), noise, "noise")):
+    for names, image, what in ((("shade",), shading, "shading"), (NOISY, noise, "noise")):
         used = [n for n in names if is_concrete(getattr(brush, n)) and float(getattr(brush, n)) > 0]
         if used and image is None:
             raise ValueError(f"{what} is None; a brush with {used[0]} > 0 needs an image of {what}")

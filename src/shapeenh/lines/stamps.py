@@ -43,6 +43,8 @@ def stamps_planes(profile, field, brush, shading, noise, *, colored, turned, mov
     bell = jnp.maximum(rise * jnp.exp(-0.5 * (distance / s) ** 2) - _CUT, 0)  # lambda exp(-d^2 / 2 s^2)
     wide = jnp.minimum(profile_width / brush.radius, 1)
     radius = brush.radius * (1 - brush.grow + brush.grow * rise) * (1 - brush.swell + brush.swell * wide)
+    if noise is not None:
+        radius = radius * (1 - brush.uneven * noise[..., 1])
     usable = profile.valid & (radius > 1e-3)
     radius = jnp.where(usable, radius, 1)
 
@@ -66,6 +68,10 @@ def stamps_planes(profile, field, brush, shading, noise, *, colored, turned, mov
     if moved and noise is not None:
         wobble = 2 * brush.wobble * (noise[..., 3] - 0.5)
         shift = jnp.stack([wobble * theta_x, wobble * theta_y])
+    if turned and noise is not None:
+        angle = brush.twist * (2 * noise[..., 2] - 1)
+        cos, sin = jnp.cos(angle), jnp.sin(angle)
+        theta_x, theta_y = cos * theta_x - sin * theta_y, sin * theta_x + cos * theta_y
     turn = jnp.stack([-theta_y, theta_x]) if turned else None
     return Stamps(weight, radius if grown else None, color, turn, shift)
 
