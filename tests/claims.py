@@ -523,7 +523,16 @@ claim(
     pick("field", "height", "direction", "singularity"),
 )
 BRUSH = {"flow": 2.0, "radius": 1.7, "aspect": 0.6, "width": 0.9, "spread": 0.3, "low": 0.1, "high": 1.1, "grow": 0.4}
-BRUSH |= {"shade": 0.3, "paper": 0.4, "gaps": 0.9, "tint": 0.5, "wobble": 0.4, "color": (0.2, 0.3, 0.1)}
+BRUSH |= {
+    "shade": 0.3,
+    "paper": 0.4,
+    "gaps": 0.9,
+    "tint": 0.5,
+    "wobble": 0.4,
+    "uneven": 0.3,
+    "twist": 0.4,
+    "color": (0.2, 0.3, 0.1),
+}
 
 
 def drawn(s, v, footprint):
