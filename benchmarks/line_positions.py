@@ -1,9 +1,10 @@
 """Where lines lie on real meshes: `python -m benchmarks.line_positions [MESH ...]`.
 
 Shares, over two views and two scales: of strong ridge pixels that are convex and of strong valley pixels that are
-concave (mean curvature of the descriptor; a skeleton pixel is one within half a pixel of its line), of occlusion line
-pixels within a pixel of a depth step (2 % of the object's depth, or the outline), and of the ink of wide brushes that
-spills from one surface onto another, with and without ending footprints at silhouettes.
+concave (mean curvature of the descriptor; a skeleton pixel is one within half a pixel of its line), of points of
+occlusion lines (sub-pixel) within half a pixel and a pixel of a step of depth, of steps with a line within a pixel,
+and of the ink of wide brushes that spills from one surface onto another, with and without ending footprints at
+silhouettes. A step is where neighbouring pixels lie more than a pixel of depth off each other's tangent planes.
 Without arguments: the bunny and the armadillo of the folder SHAPEENH_DATA, and the embedded knot.
 """
 
@@ -13,6 +14,8 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
+from tests.reference.lines import line_points, step_points
 
 import shapeenh as se
 from benchmarks import harness
@@ -32,20 +35,21 @@ def curved(kind: str, gbuffer, descriptor) -> tuple[int, int]:
     return int(on.sum()), int((sign * np.asarray(se.mean_curvature(descriptor.hessian))[on] > 0).sum())
 
 
-def occluding(gbuffer, descriptor) -> tuple[int, int]:
-    """(skeleton pixels of occlusion lines, those of them next to a step)."""
-    on = skeleton(se.fit_profile(se.line_field("occlusion", gbuffer, descriptor), radius=3.0, least=0.05))
-    mask, depth = np.asarray(gbuffer.mask), np.asarray(gbuffer.depth)
-    seen = np.where(mask, depth, 10 * depth.max())
-    near = np.zeros_like(mask)
-    for axis in (0, 1):
-        jump = np.abs(np.diff(seen, axis=axis)) > 0.02 * np.ptp(depth[mask])
-        for ends in ((1, 0), (0, 1)):
-            near |= np.pad(jump, [ends if k == axis else (0, 0) for k in (0, 1)])
-    wide = np.pad(near, 1)
-    h, w = near.shape
-    near = wide[1:-1, 1:-1] | wide[:h, 1:-1] | wide[2:, 1:-1] | wide[1:-1, :w] | wide[1:-1, 2:]
-    return int(on.sum()), int((on & near).sum())
+def occluding(gbuffer, descriptor, camera) -> dict:
+    """How far the points of occlusion lines are from steps of depth of more than a pixel, and those of more than five
+    from the lines."""
+    field = se.line_field("occlusion", gbuffer, descriptor)
+    profile = se.fit_profile(field, radius=2.0, least=0.05)
+    points = line_points(profile, field)
+    off = KDTree(step_points(gbuffer, camera, 1.0)).query(points)[0]
+    missed = KDTree(points).query(step_points(gbuffer, camera, 5.0))[0]
+    return {
+        "occlusion px": len(points),
+        "within 0.5 px": float(np.mean(off <= 0.5)),
+        "within 1 px": float(np.mean(off <= 1)),
+        "farthest": float(off.max()),
+        "steps drawn": float(np.mean(missed <= 1)),
+    }
 
 
 def spilled(gbuffer, descriptor) -> tuple[float, float]:
@@ -64,8 +68,7 @@ def main() -> None:
     parser.add_argument("meshes", nargs="*", type=Path)
     parser.add_argument("--height", type=int, default=600)
     arguments = parser.parse_args()
-    paths = arguments.meshes or [p for p in map(harness.data, ("bunny.obj", "armadillo.obj")) if p]
-    meshes = {p.stem: se.load_mesh(p) for p in paths} | {"knot": se.carved_knot()}
+    meshes = harness.meshes(arguments.meshes) | {"knot": se.carved_knot()}
     rows = []
     for name, mesh in meshes.items():
         for direction in DIRECTIONS:
@@ -77,8 +80,7 @@ def main() -> None:
                 for kind in ("ridge", "valley"):
                     total, right = curved(kind, gbuffer, descriptor)
                     row |= {f"{kind} px": total, f"{kind} right": right / max(total, 1)}
-                total, right = occluding(gbuffer, descriptor)
-                row |= {"occlusion px": total, "at steps": right / max(total, 1)}
+                row |= occluding(gbuffer, descriptor, camera)
                 row["spilled"], row["spilled, TH10"] = spilled(gbuffer, descriptor)
                 rows.append(row)
     print(harness.table(rows))

@@ -120,3 +120,31 @@ def direction_singularity(direction, mask):
         ]
         out[i, j] = 1 - np.mean(cosines) if cosines else 1
     return out
+
+
+def step_points(gbuffer, camera, least: float) -> np.ndarray:
+    """[n, 2] (row, column), four to a pixel, along the borders between pixels where the surface is torn: either of two
+    neighbours lies more than `least` px of depth off the other one's tangent plane, or one is background."""
+    mask, position, normal = (np.asarray(a) for a in (gbuffer.mask, gbuffer.position, gbuffer.normal))
+    perspective = np.where(mask, np.asarray(gbuffer.depth), 1)
+    pixel = 2 * perspective / (mask.shape[0] * float(camera.projection[1, 1]))
+    found = []
+    for axis in (0, 1):
+        a, b = np.arange(mask.shape[axis] - 1), np.arange(1, mask.shape[axis])
+        at = lambda image, i: np.take(image, i, axis=axis)  # noqa: E731, B023
+        across = at(position, b) - at(position, a)
+        off = np.maximum(*(np.abs(np.sum(across * at(normal, i), -1)) for i in (a, b)))
+        torn = (off > least * np.minimum(at(pixel, a), at(pixel, b))) & at(mask, a) & at(mask, b)
+        rows, columns = np.nonzero(torn | (at(mask, a) != at(mask, b)))
+        for along in (-0.375, -0.125, 0.125, 0.375):
+            spots = (rows + 0.5, columns + along) if axis == 0 else (rows + along, columns + 0.5)
+            found.append(np.stack(spots, -1))
+    return np.concatenate(found)
+
+
+def line_points(profile, field) -> np.ndarray:
+    """[n, 2] (row, column) of the skeletons, as the pixels within a pixel of one say."""
+    near = np.asarray(profile.valid) & (np.abs(profile.distance) <= 1)
+    rows, columns = np.nonzero(near)
+    distance, theta = np.asarray(profile.distance)[near], np.asarray(field.direction)[near]
+    return np.stack([rows - distance * theta[:, 1], columns + distance * theta[:, 0]], -1)

@@ -143,7 +143,7 @@ def object_lines(gbuffer, descriptor, picture, camera, arguments, kinds):
         image = luminance(picture) if kind == "luminance" else None
         field = line_field(kind, gbuffer, descriptor, luminance=image, sigma=1.0)
         brush = _brush(arguments, kind, height)
-        profile = fit_profile(field, radius=3.0 if kind == "occlusion" else 4.0, least=float(brush.low))
+        profile = fit_profile(field, radius=2.0 if kind == "occlusion" else 4.0, least=float(brush.low))
         inputs = {"footprint": style_footprint(arguments.style), "shading": picture, "noise": noise}
         if kind != "occlusion":  # those lie on the silhouettes, all others end there
             inputs |= {"gbuffer": gbuffer, "descriptor": descriptor}

@@ -19,7 +19,7 @@ from shapeenh.types import Descriptor, GBuffer, LineField
 
 KINDS = ("occlusion", "surface", "luminance", "ridge", "valley", "inflection")
 GREATEST_SIGMA = 20.0
-_STEP_SIGMA = 1.5  # px
+_STEP_SIGMA = 0.75  # px
 
 # ------------------------------------------------------------------------------------------- public
 
@@ -44,8 +44,9 @@ def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=1.0) -> 
         descriptor: Descriptor of the same image; None for luminance without geometry.
         luminance: [H, W], for kind "luminance" and no other.
         sigma: [], px, in [0, 20]: heights and directions are diffused this far, insulated by silhouettes. (Occlusion
-            lines live *on* the silhouettes: they are diffused freely, background included, and by 1.5 px more, since a
-            step is thinner than any profile.)
+            lines live *on* the silhouettes: they are diffused freely, background included, and by 0.75 px more, since a
+            step is thinner than any profile. Fit them with a radius of 2: steps less than 3 px apart become one line
+            between them, with larger radii sooner.)
 
     Static: kind.
     Returns: LineField [H, W]; 0 off the mask with singularity 1 there, except occlusion lines, which straddle the
