@@ -1,7 +1,8 @@
-"""Diffuse environment light two ways, error and time: `python -m benchmarks.diffuse`.
+"""Diffuse environment light, prefiltered and sampled, error and time: `python -m benchmarks.diffuse`.
 
-Nine spherical harmonics against a cosine-convolved map of several heights, looked up at 480,000 normals. The error is
-relative to the irradiance summed over every pixel of the map, root mean square and largest.
+Nine spherical harmonics, cosine-convolved maps of several heights, and sums over lights sampled by median cut, at
+480,000 normals. The error is relative to the irradiance summed over every pixel of the map, root mean square (relative
+to the mean irradiance) and largest. Lights: Lambert's sum has the error, `shade` of a matt material the time.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import shapeenh as se
 from benchmarks import harness
 from shapeenh.scene.environment import map_directions, map_solid_angles
 
+HEIGHTS, COUNTS = (8, 16, 32, 64), (16, 54, 256, 1024)
+
 
 def exact(radiance, normal):
     """Float64: integral L <n.l> dl / pi by every pixel."""
@@ -23,44 +26,61 @@ def exact(radiance, normal):
     return np.stack([np.maximum(direction @ n, 0) @ weight.reshape(-1, 3) for n in normal]) / np.pi
 
 
+def pixels(normal) -> se.GBuffer:
+    """A G-buffer of these normals, [H, W, 3], n_z > 0."""
+    one = jnp.ones(normal.shape[:2], jnp.float32)
+    return se.GBuffer(one > 0, one, normal, normal)
+
+
+def lambert(lights, normal):
+    """Float64: the sum over lights of L max(n.l, 0) / pi."""
+    direction, radiance = (np.asarray(a, np.float64) for a in (lights.direction, lights.radiance))
+    return np.maximum(np.asarray(normal, np.float64) @ direction.T, 0) @ radiance / np.pi
+
+
 def main() -> None:
     rng = np.random.default_rng(0)
-    few = rng.normal(size=(300, 3))
-    few /= np.linalg.norm(few, axis=-1, keepdims=True)
-    many = rng.normal(size=(600, 800, 3))
-    many = jnp.asarray(many / np.linalg.norm(many, axis=-1, keepdims=True), jnp.float32)
-    maps = {"studio": se.procedural_studio(), "sky": se.procedural_sky()}
-    for name in ("studio", "venice"):
-        path = harness.data(f"{name}.exr")
-        if path:
-            maps[f"{name}.exr"] = jnp.maximum(se.load_environment(path), 0)
+
+    def normals(*shape):
+        n = rng.normal(size=(*shape, 3))
+        n[..., 2] = np.abs(n[..., 2]) + 0.02
+        return n / np.linalg.norm(n, axis=-1, keepdims=True)
+
+    few, many = normals(1, 300), jnp.asarray(normals(600, 800), jnp.float32)
+    harmonic, lookup = jax.jit(se.harmonic_radiance), jax.jit(se.environment_radiance)
+    white = se.Material(jnp.ones(3))
     rows = []
-    for name, radiance in maps.items():
-        reference = exact(radiance, few)
-        harmonic = jax.jit(se.harmonic_radiance)
-        lookup = jax.jit(se.environment_radiance)
-        tables = {"harmonics": (se.spherical_harmonics(radiance), harmonic)}
-        tables |= {f"map, {h} rows": (se.prefilter_map(radiance, height=h), lookup) for h in (8, 16, 32, 64)}
-        times = harness.measure({k: lambda t=t, f=f: f(t, many) for k, (t, f) in tables.items()})
-        for kind, (table, function) in tables.items():
-            error = np.abs(np.asarray(function(table, jnp.asarray(few, jnp.float32))) / reference - 1)
-            rows.append(
-                {"map": name, "kind": kind, "rms": round(float(np.sqrt(np.mean(error**2))), 5)}
-                | {"largest": round(float(error.max()), 4), "lookup_ms": times[kind]["median_ms"]}
-            )
+    for name, radiance in harness.maps().items():
+        reference = exact(radiance, few[0])
+        ways = {"harmonics, 9": (se.spherical_harmonics(radiance), harmonic)}
+        ways |= {f"map, {h} rows": (se.prefilter_map(radiance, height=h), lookup) for h in HEIGHTS}
+        ways |= {
+            f"lights, {n}": (se.sample_environment(radiance, n), lambda lights, n: se.shade(pixels(n), lights, white))
+            for n in COUNTS
+        }
+        times = harness.measure({k: lambda t=t, f=f: f(t, many) for k, (t, f) in ways.items()})
+        for kind, (table, function) in ways.items():
+            found = (lambert if kind.startswith("lights") else function)(table, jnp.asarray(few, jnp.float32))
+            error = np.abs(np.asarray(found)[0] - reference)
+            rms = float(np.sqrt(np.mean(error**2)) / np.mean(reference))
+            largest = float(np.max(error / reference))
+            row = {"map": name, "kind": kind, "rms": round(rms, 5), "largest": round(largest, 4)}
+            rows.append(row | {"lookup_ms": times[kind]["median_ms"]})
     print(harness.table(rows))
-    kinds = {r["kind"]: [] for r in rows}
+    kinds: dict[str, list] = {r["kind"]: [] for r in rows}
     for r in rows:
         kinds[r["kind"]].append((r["lookup_ms"], r["rms"]))
     mean = {kind: np.exp(np.mean(np.log(found), axis=0)) for kind, found in kinds.items()}
-    series = {
-        "harmonics": [("9", *mean["harmonics"])],
-        "map": [(kind.split()[1], *values) for kind, values in mean.items() if kind != "harmonics"],
-    }
-    harness.pareto("diffuse", series, default="map 32", title="Prefiltered diffuse light", error="relative rms error")
+    series: dict[str, list] = {}
+    for kind, values in mean.items():
+        which, size = kind.removesuffix(" rows").split(", ")
+        series.setdefault(which, []).append((size, *values))
+    harness.pareto("diffuse", series, default="map 32", title="Diffuse light of a map", error="relative rms error")
+    default, nine, lights = (mean[k] for k in ("map, 32 rows", "harmonics, 9", "lights, 54"))
     said = (
-        f"Default: a cosine-convolved map of 32 rows, error {mean['map, 32 rows'][1]:.4f}. Nine harmonics take "
-        f"{mean['harmonics'][0] / mean['map, 32 rows'][0]:.2f} of its time: {mean['harmonics'][1]:.4f}."
+        f"Default: a cosine-convolved map of 32 rows, error {default[1]:.4f}. Nine harmonics take "
+        f"{nine[0] / default[0]:.2f} of its time: {nine[1]:.4f}; 54 sampled lights, which can be warped and reflect "
+        f"highlights too, {lights[0] / default[0]:.1f} times its time: {lights[1]:.4f}."
     )
     print(harness.write("diffuse", rows, answer=said))
     print(said)

@@ -63,11 +63,7 @@ def main() -> None:
     parser.add_argument("--lights", type=int, default=54)
     arguments = parser.parse_args()
     width, height = (int(n) for n in arguments.size.split("x"))
-    meshes = {p.stem: se.load_mesh(p) for p in arguments.meshes}
-    if not meshes:
-        found = {name: harness.data(f"{name}.obj") for name in ("bunny", "armadillo")}
-        meshes = {name: se.load_mesh(path) for name, path in found.items() if path}
-        meshes["knot"] = se.carved_knot()
+    meshes = harness.meshes(arguments.meshes, knot=True)
     rows = []
     for name, mesh in meshes.items():
         calls, facts = stages(mesh, se.procedural_studio(), width=width, height=height, count=arguments.lights)

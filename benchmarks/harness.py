@@ -1,5 +1,9 @@
-"""What every benchmark shares: interleaved timing with compile apart, a table, JSON with the machine, a plot, a data
-folder."""
+"""What every benchmark shares: interleaved timing with compile apart, a table, JSON with the machine, a plot, meshes
+and maps.
+
+With the environment variable BENCHMARKS_QUICK (`python -m benchmarks --quick` sets it) everything is timed three times
+at most, and results go to a folder of their own: a rough look, and a test that every script runs.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +15,13 @@ import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-RESULTS = Path(__file__).parent / "results"
+import shapeenh as se
+
+QUICK = bool(os.environ.get("BENCHMARKS_QUICK"))
+RESULTS = Path(__file__).parent / "results" / ("quick" if QUICK else "")
 
 
 def measure(calls: dict, *, repeats: int = 9, seconds: float = 20.0) -> dict[str, dict[str, float]]:
@@ -21,6 +29,8 @@ def measure(calls: dict, *, repeats: int = 9, seconds: float = 20.0) -> dict[str
 
     Returns per name: `first_ms` (compile and run), `median_ms`, `min_ms`, `runs`.
     """
+    if QUICK:
+        repeats, seconds = min(repeats, 3), min(seconds, 2.0)
     times: dict[str, list[float]] = {name: [] for name in calls}
     first = {name: _milliseconds(call) for name, call in calls.items()}
     start = time.perf_counter()
@@ -84,7 +94,7 @@ def _text(value) -> str:
 
 def write(name: str, rows: list[dict], **more) -> Path:
     """`results/NAME.json`: the machine, the rows, and whatever else there is to say."""
-    RESULTS.mkdir(exist_ok=True)
+    RESULTS.mkdir(parents=True, exist_ok=True)
     path = RESULTS / f"{name}.json"
     path.write_text(json.dumps({"machine": machine(), **more, "rows": rows}, indent=1) + "\n")
     return path
@@ -93,7 +103,8 @@ def write(name: str, rows: list[dict], **more) -> Path:
 def pareto(name: str, series: dict[str, list[tuple]], *, default: str, title: str, error: str) -> Path | None:
     """`results/NAME.png`: milliseconds against error, one line per series of (label, ms, error), the default ringed.
 
-    None, and a word, where matplotlib (the extra `bench`) is not installed.
+    Scales are logarithmic; where an error is 0, that of errors is linear below the smallest other one. None, and a
+    word, where matplotlib (the extra `bench`) is not installed.
     """
     try:
         from matplotlib.figure import Figure
@@ -102,6 +113,9 @@ def pareto(name: str, series: dict[str, list[tuple]], *, default: str, title: st
         return None
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.add_subplot(xscale="log", yscale="log", xlabel="milliseconds", ylabel=error, title=title)
+    errors = [p[2] for points in series.values() for p in points]
+    if min(errors) <= 0 < max(errors):
+        axes.set_yscale("symlog", linthresh=min(e for e in errors if e > 0))
     for label, points in series.items():
         axes.plot([p[1] for p in points], [p[2] for p in points], "o-", label=label, markersize=4)
         for text, ms, value in points:
@@ -111,7 +125,7 @@ def pareto(name: str, series: dict[str, list[tuple]], *, default: str, title: st
     axes.grid(alpha=0.3, which="both")
     if len(series) > 1:
         axes.legend(fontsize=8)
-    RESULTS.mkdir(exist_ok=True)
+    RESULTS.mkdir(parents=True, exist_ok=True)
     path = RESULTS / f"{name}.png"
     figure.savefig(path, dpi=100)
     return path
@@ -122,3 +136,18 @@ def data(name: str) -> Path | None:
     folder = os.environ.get("SHAPEENH_DATA")
     path = Path(folder) / name if folder else None
     return path if path is not None and path.exists() else None
+
+
+def meshes(paths=(), names=("bunny", "armadillo"), *, knot: bool = False) -> dict[str, se.Mesh]:
+    """By name: the files of `paths`; else those of `names` that the data folder has, and, where it has none or where
+    `knot` asks for it, the embedded object."""
+    found = paths or [p for p in map(data, (f"{name}.obj" for name in names)) if p]
+    loaded = {Path(p).stem: se.load_mesh(p) for p in found}
+    return loaded | {"knot": se.carved_knot()} if not loaded or (knot and not paths) else loaded
+
+
+def maps(names=("studio", "venice"), *, embedded: bool = True) -> dict[str, jax.Array]:
+    """By name: the embedded radiance maps, and those of `names` that the data folder has, without negative pixels."""
+    made = {"studio": se.procedural_studio(), "sky": se.procedural_sky()} if embedded else {}
+    files = {f"{name}.exr": data(f"{name}.exr") for name in names}
+    return made | {name: jnp.maximum(se.load_environment(path), 0) for name, path in files.items() if path}

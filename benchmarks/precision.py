@@ -5,8 +5,8 @@ before it (rounded to float32), and `cumulative`, fed with the float32 result. V
 that snaps to another 1/256 px shows another face at a handful of pixels; these, and what diffusion mixes with them, are
 left out. Errors are relative to the size of the value: a vector's length, a tensor's norm, but never less than 1e-3 of
 the image's own rms, so that zeros do not count as infinitely wrong. Half an ulp of float32 is 6e-8. Last, the lights'
-colours rounded to bfloat16. Without meshes: bunny.obj and armadillo.obj of the folder SHAPEENH_DATA where there is one,
-and the embedded knot.
+colours rounded to bfloat16, and the normals and Hessians that light reads; and the time of the whole chain in each.
+Without meshes: bunny.obj and armadillo.obj of the folder SHAPEENH_DATA where there is one, and the embedded knot.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import shapeenh as se
 from benchmarks import harness
 
 ALPHA, GAMMA, SIGMA = 40.0, 0.2, 2.0
+LIGHTS16, BUFFERS16 = "lights in bfloat16", "lights, normals, Hessians in bfloat16"
 LIMITS = {
     "position": "rounding of the coordinates",
     "normal": "barycentric weights: a face one pixel large has corners whose differences keep few of their digits",
@@ -62,6 +63,10 @@ class Chain:
     def tensor(self, descriptor):
         return se.warp_tensor(descriptor.hessian, self.alpha)
 
+    def picture(self):
+        gbuffer = self.gbuffer()
+        return self.shade(gbuffer, self.describe(gbuffer))
+
     def shade(self, gbuffer, descriptor):
         material = se.named_material("porcelain")
         return se.shade_warped(gbuffer, descriptor, self.lights, material, alpha=self.alpha, gamma=GAMMA)
@@ -89,8 +94,13 @@ def around(flags, reach: int):
     return out
 
 
-def budget(mesh, environment, *, width: int, height: int, count: int) -> tuple[list[dict], dict]:
-    """Rows per stage, and facts: pixels compared, pixels that see another face."""
+def halved(a):
+    """Stored in bfloat16; a stage makes float32 of it."""
+    return a.astype(jnp.bfloat16).astype(jnp.float32)
+
+
+def budget(mesh, environment, *, width: int, height: int, count: int) -> tuple[list[dict], dict, dict]:
+    """Rows per stage; facts: pixels compared, pixels that see another face; calls of the chain by precision."""
     size = {"height": height, "width": width}
     camera = se.frame_mesh(mesh, direction=(0.34, 0.26, 0.90), aspect=width / height)
     lights = se.rotate_lights(se.sample_environment(environment, count), camera)
@@ -129,11 +139,22 @@ def budget(mesh, environment, *, width: int, height: int, count: int) -> tuple[l
     for stage, (alone, after, wanted) in pairs.items():
         for kind, got in (("own", alone), ("cumulative", after)):
             rows.append({"stage": stage, "error": kind, **errors(got, wanted, mask)})
-    low = se.Lights(single.lights.direction, single.lights.radiance.astype(jnp.bfloat16).astype(jnp.float32))
-    coarse = dataclasses.replace(single, lights=low).shade(rough, rough_form)
-    rows.append({"stage": "radiance", "error": "lights in bfloat16", **errors(coarse, image, mask)})
+    low = dataclasses.replace(single, lights=se.Lights(single.lights.direction, halved(single.lights.radiance)))
+
+    def stored():
+        gbuffer = single.gbuffer()
+        form = single.describe(gbuffer)
+        gbuffer = dataclasses.replace(gbuffer, normal=halved(gbuffer.normal))
+        return low.shade(gbuffer, dataclasses.replace(form, hessian=halved(form.hessian)))
+
+    def wide():
+        with jax.enable_x64(True):
+            return double.picture()
+
+    for kind, coarse in ((LIGHTS16, low.shade(rough, rough_form)), (BUFFERS16, stored())):
+        rows.append({"stage": "radiance", "error": kind, **errors(coarse, image, mask)})
     facts = {"pixels": int(mask.sum()), "other face": int((seen != also).sum())}
-    return rows, facts
+    return rows, facts, {"float64": wide, "float32": single.picture, LIGHTS16: low.picture, BUFFERS16: stored}
 
 
 def main() -> None:
@@ -143,28 +164,39 @@ def main() -> None:
     parser.add_argument("--lights", type=int, default=54)
     arguments = parser.parse_args()
     width, height = (int(n) for n in arguments.size.split("x"))
-    meshes = {p.stem: se.load_mesh(p) for p in arguments.meshes}
-    if not meshes:
-        found = {name: harness.data(f"{name}.obj") for name in ("bunny", "armadillo")}
-        meshes = {name: se.load_mesh(path) for name, path in found.items() if path}
-        meshes["knot"] = se.carved_knot()
-    rows, facts = [], {}
+    meshes = harness.meshes(arguments.meshes, knot=True)
+    rows, facts, times = [], {}, []
     for name, mesh in meshes.items():
-        made, facts[name] = budget(mesh, se.procedural_studio(), width=width, height=height, count=arguments.lights)
+        made, facts[name], calls = budget(
+            mesh, se.procedural_studio(), width=width, height=height, count=arguments.lights
+        )
         rows += [{"mesh": name, **row} for row in made]
+        last = {r["error"]: r["99 %"] for r in made if r["stage"] == "radiance"} | {"float64": 0.0}
+        last["float32"] = last["cumulative"]
+        for kind, found in harness.measure(calls).items():
+            times.append({"mesh": name, "precision": kind, "99 %": last[kind], **found})
     print(harness.table(rows))
+    print(harness.table(times))
     for name, fact in facts.items():
         print(name, fact)
     of = lambda stage, kind: [r for r in rows if (r["stage"], r["error"]) == (stage, kind)]  # noqa: E731
-    whole, bf16 = of("radiance", "cumulative"), of("radiance", "lights in bfloat16")
+    whole, bf16 = of("radiance", "cumulative"), of("radiance", LIGHTS16)
+    ms = {kind: np.array([t["median_ms"] for t in times if t["precision"] == kind]) for kind in ("float64", "float32")}
     answer = (
         f"The default is float32: the picture is {max(r['median'] for r in whole):.1g} off in the median and "
         f"{max(r['99 %'] for r in whole):.1g} at 99 % of the pixels, a display step being 4e-3; lights in bfloat16 "
-        f"would cost {max(r['median'] for r in bf16):.1g} in the median for 6 bytes per light."
+        f"would cost {max(r['median'] for r in bf16):.1g} in the median for 6 bytes per light. float64 "
+        f"takes {np.median(ms['float64'] / ms['float32']):.1f} times as long."
+    )
+    series: dict[str, list] = {}
+    for t in times:
+        series.setdefault(t["mesh"], []).append((t["precision"], t["median_ms"], t["99 %"]))
+    harness.pareto(
+        "precision", series, default="float32", title="Precision of the chain", error="relative error at 99 % of pixels"
     )
     print(answer)
     options = {"size": arguments.size, "lights": arguments.lights}
-    print(harness.write("precision", rows, facts=facts, limits=LIMITS, answer=answer, **options))
+    print(harness.write("precision", rows, facts=facts, times=times, limits=LIMITS, answer=answer, **options))
 
 
 if __name__ == "__main__":

@@ -34,8 +34,7 @@ def recombined(plain, small_plain, small_warped, mask):
 
 
 def main() -> None:
-    meshes = {name: harness.data(f"{name}.obj") for name in ("bunny", "armadillo")}
-    meshes = {name: se.load_mesh(path) for name, path in meshes.items() if path} or {"knot": se.carved_knot()}
+    meshes = harness.meshes()
     world, material = se.sample_environment(se.procedural_studio(), 54), se.named_material("stone")
     rows = []
     for name, mesh in meshes.items():

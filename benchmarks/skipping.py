@@ -21,8 +21,7 @@ SIZE = {"height": 600, "width": 800}
 
 def pairs() -> dict[str, tuple]:
     """Name -> (general call, call that skips)."""
-    path = harness.data("armadillo.obj")
-    mesh = se.load_mesh(path) if path else se.carved_knot()
+    mesh = next(iter(harness.meshes(names=("armadillo",)).values()))
     camera = se.frame_mesh(mesh, direction=(0.3, 0.2, 1), aspect=4 / 3)
     g = se.render_gbuffer(mesh, camera, **SIZE)
     d = se.describe(g, sigma=2.0)

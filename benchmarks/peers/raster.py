@@ -1,7 +1,7 @@
 """Other people's rasterisers and ray casters as calls of no arguments, for those that are installed.
 
 Every peer gets the same mesh and camera. What it answers: `ids` the nearest face per pixel, `G-buffer` position (or
-depth) and normal per pixel. Not timed: uploads, and the BVH of the ray casters.
+depth) and normal per pixel. Not timed: uploads, the BVH of the ray casters, and what `read_ids` does.
 """
 
 from __future__ import annotations
@@ -75,6 +75,7 @@ def llvmpipe(vertices, faces, normals, camera, height, width) -> dict:
             target.clear()
             array.render()
             context.finish()
+            return target
 
         draw()
         made[row] = draw
@@ -100,7 +101,11 @@ def mitsuba(vertices, faces, normals, camera, height, width) -> dict:
         drjit.eval(hit.p, hit.sh_frame.n, hit.prim_index)
         drjit.sync_thread()
 
-    return {"ids": lambda: np.asarray(world.ray_intersect_preliminary(ray).prim_index), "G-buffer": gbuffer}
+    def ids():
+        hit = world.ray_intersect_preliminary(ray)
+        return np.asarray(drjit.select(hit.is_valid(), hit.prim_index, 0xFFFFFFFF))
+
+    return {"ids": ids, "G-buffer": gbuffer}
 
 
 def open3d(vertices, faces, normals, camera, height, width) -> dict:
@@ -128,6 +133,13 @@ def deodr(vertices, faces, normals, camera, height, width) -> dict:
         background_color=np.zeros(3), backface_culling=False, perspective_correct=True, integer_pixel_centers=False,
     )  # fmt: skip
     return {"G-buffer": lambda: scene.render(0.0)}
+
+
+def read_ids(answer, height: int, width: int):
+    """[H, W] int32, -1 for none, of what a call of ids returned: an array (all bits set for none) or a framebuffer."""
+    if hasattr(answer, "read"):
+        return np.frombuffer(answer.read(components=1, dtype="i4"), np.int32).reshape(height, width) - 1
+    return np.asarray(answer).astype(np.int32).reshape(height, width)
 
 
 PEERS = {"llvmpipe": llvmpipe, "Mitsuba 3": mitsuba, "Open3D": open3d, "DEODR": deodr}

@@ -1,0 +1,164 @@
+"""What a gradient costs, stage by stage: `python -m benchmarks.gradients [MESH] [--size WxH] [--lights N]`.
+
+Each stage on the finished results of those before it, under `jit`: the value of a loss (the mean square of what the
+stage makes), and that value together with its gradient in what is named. Both are the general variants, which a
+derivative needs; called directly, a stage may skip more (docs/skipping.md). Without a mesh: armadillo.obj of the folder
+SHAPEENH_DATA where there is one, else the embedded knot. The goal is a ratio of 3.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+import shapeenh as se
+from benchmarks import harness
+from shapeenh.types import replace
+
+ALPHA, SIGMA, LEAST = 40.0, 2.0, 0.05
+REACH = 8  # px, of a brush whose radius is not known
+GOAL = 3.0
+
+
+def stages(mesh, *, width: int, height: int, count: int) -> list[tuple]:
+    """(stage, in what, function of a dict of arguments, the arguments)."""
+    camera = se.frame_mesh(mesh, direction=(0.34, 0.26, 0.90), aspect=width / height)
+    size = {"height": height, "width": width}
+    world = se.sample_environment(se.procedural_studio(), count)
+    lights = se.rotate_lights(world, camera)
+    material = se.Material(jnp.full(3, 0.6), jnp.full(3, 0.05), jnp.asarray(50.0))
+    gbuffer = se.render_gbuffer(mesh, camera, **size)
+    scale = height / 600
+    descriptor = se.describe(gbuffer, sigma=SIGMA * scale)
+    field = se.line_field("valley", gbuffer, descriptor, sigma=SIGMA)
+    profile = se.fit_profile(field, least=LEAST)
+    image = se.shade_warped(gbuffer, descriptor, lights, material, alpha=ALPHA * scale)
+    style = se.style_brush("ink", "valley", height=height)
+    number = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    shape = {"vertices": mesh.vertices, "normals": mesh.normals, "camera": camera}
+
+    def solid(v):
+        return replace(mesh, vertices=v["vertices"], normals=v["normals"])
+
+    def described(v):
+        return se.describe(replace(gbuffer, normal=v.get("normal", gbuffer.normal)), sigma=v["sigma"]).hessian
+
+    def shaded(v):
+        g = replace(gbuffer, normal=v.get("normal", gbuffer.normal))
+        d = replace(descriptor, hessian=v.get("hessian", descriptor.hessian))
+        return g, d, se.Lights(lights.direction, v["radiance"]), v["material"]
+
+    def warped(v):
+        return se.shade_warped(*shaded(v), alpha=v["alpha"], gamma=v["gamma"])
+
+    def scaled(v):
+        gammas = {"gamma_diffuse": v["gamma"], "gamma_specular": v["gamma"]}
+        return se.shade_scaled(*shaded(v), invariant=v["invariant"], anisotropy=v["anisotropy"], **gammas)
+
+    def framed(v):
+        light = se.Lights(world.direction, v["radiance"])
+        return se.render(solid(shape | v), camera, light, material, se.LightWarp(v["alpha"]), sigma=SIGMA, **size)
+
+    def resolved(v):
+        g = se.render_gbuffer(solid(v), v["camera"], **size)
+        return g.normal, g.position
+
+    def plain(v):
+        g, _, light, stuff = shaded(v)
+        return se.shade(g, light, stuff)
+
+    def lined(v):
+        bent = replace(descriptor, hessian=v["hessian"], gradient=v["slope"])
+        f = se.line_field("valley", gbuffer, bent, sigma=v["sigma"])
+        return f.height, f.direction
+
+    def fitted(v):
+        return se.fit_profile(replace(field, height=v["height"], direction=v["direction"]), least=LEAST).distance
+
+    def drawn(v):
+        return se.draw_lines(
+            replace(profile, distance=v["distance"]), field, replace(style, radius=v["radius"]), reach=REACH
+        )
+
+    def shown(v):
+        return se.tone_map(v["image"], exposure=v["exposure"], white=v["white"])
+
+    def measured(v):
+        return se.contrast(v["image"], gbuffer.mask)
+
+    look = {"alpha": number(ALPHA * scale), "gamma": number(0.2), "radiance": lights.radiance, "material": material}
+    tuned = {k: look[k] for k in ("radiance", "material")}
+    matt = dict(tuned)
+    tuned |= {"invariant": number(0.4), "gamma": number(2.0), "anisotropy": number(0.5)}
+    bent = {"normal": gbuffer.normal, "hessian": descriptor.hessian}
+    smooth, slope = {"sigma": number(SIGMA * scale)}, {"slope": descriptor.gradient, "sigma": number(SIGMA)}
+    profiled = {"height": field.height, "direction": field.direction}
+    inked = {"distance": profile.distance, "radius": number(style.radius)}
+    display = {"image": image, "exposure": number(1.0), "white": number(4.0)}
+    lit = {"alpha": number(ALPHA), "radiance": world.radiance}
+    solids = {"vertices": mesh.vertices, "normals": mesh.normals}
+    return [
+        ("rasterise and resolve", "vertices, normals, camera", resolved, shape),
+        ("describe", "sigma", described, smooth),
+        ("describe", "normals, sigma", described, smooth | {"normal": gbuffer.normal}),
+        ("shade", "lights, material", plain, matt),
+        ("shade_warped", "alpha, gamma, lights, material", warped, look),
+        ("shade_warped", "also normals, Hessian", warped, look | bent),
+        ("shade_scaled", "strengths, lights, material", scaled, tuned),
+        ("shade_scaled", "also normals, Hessian", scaled, tuned | bent),
+        ("line_field", "Hessian, slopes, sigma", lined, slope | {"hessian": descriptor.hessian}),
+        ("fit_profile", "height, direction", fitted, profiled),
+        ("draw_lines", "distance, radius", drawn, inked),
+        ("tone_map", "radiance, exposure, white", shown, display),
+        ("contrast", "radiance", measured, {"image": image}),
+        ("frame", "alpha, lights", framed, lit),
+        ("frame", "also vertices, normals", framed, lit | solids),
+    ]
+
+
+def loss(function, values):
+    parts = jax.tree.leaves(function(values))
+    return sum(jnp.mean(jnp.square(part)) for part in parts)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("mesh", nargs="?", type=Path)
+    parser.add_argument("--size", default="800x600")
+    parser.add_argument("--lights", type=int, default=54)
+    arguments = parser.parse_args()
+    width, height = (int(n) for n in arguments.size.split("x"))
+    paths = [arguments.mesh] if arguments.mesh else []
+    name, mesh = next(iter(harness.meshes(paths, ("armadillo",)).items()))
+    rows = []
+    for stage, what, function, given in stages(mesh, width=width, height=height, count=arguments.lights):
+        value = jax.jit(lambda v, f=function: loss(f, v))
+        both = jax.jit(jax.value_and_grad(lambda v, f=function: loss(f, v)))
+        calls = {
+            "value": lambda f=value, v=given: f(v),
+            "with gradient": lambda f=both, v=given: f(v),
+        }
+        times = harness.measure(calls, seconds=4)
+        ms = {call: found["median_ms"] for call, found in times.items()}
+        row = {"stage": stage, "in": what, "value_ms": ms["value"], "with_gradient_ms": ms["with gradient"]}
+        row |= {"ratio": round(ms["with gradient"] / ms["value"], 2)}
+        rows.append(row | {"compile_s": round(times["with gradient"]["first_ms"] / 1e3, 1)})
+        print(rows[-1], flush=True)
+    print(harness.table(rows))
+    frames = {r["in"]: r["ratio"] for r in rows if r["stage"] == "frame"}
+    over = [f"{r['stage']} ({r['in']}) {r['ratio']:.1f}" for r in rows if r["ratio"] > GOAL and r["stage"] != "frame"]
+    said = (
+        f"A frame with its gradient takes {frames['alpha, lights']:.1f} times the value's time in alpha and lights, "
+        f"{frames['also vertices, normals']:.1f} times in vertices and normals too. "
+        + (f"More than {GOAL:g} times: {', '.join(over)}." if over else f"No stage takes more than {GOAL:g} times.")
+    )
+    facts = {"mesh": name, "size": arguments.size, "lights": arguments.lights}
+    print(harness.write("gradients", rows, answer=said, **facts))
+    print(said)
+
+
+if __name__ == "__main__":
+    main()
