@@ -14,9 +14,13 @@ import numpy as np
 from jax import lax
 
 from shapeenh.checks import check_range, check_shape, check_size, check_type, float_dtype
+from shapeenh.fusion import stored, unknown_truth
+from shapeenh.stencils import shift
 from shapeenh.types import Camera, GBuffer
 
 CHANNELS = 4  # paper, gaps, tint, wobble (see `Brush`)
+_GRAZING = 0.125  # cosines below this make cells no larger
+_BEYOND = 6  # px
 
 
 def surface_noise(gbuffer, camera, *, size=6.0, seed: int = 0):
@@ -31,8 +35,10 @@ def surface_noise(gbuffer, camera, *, size=6.0, seed: int = 0):
         seed: which noise, 0 to 2^31 - 1.
 
     Static: seed.
-    Returns: [H, W, 4] in [0, 1], mean about 1/2. Off the mask it is noise on the plane of mean depth.
-    Gradient: with respect to position and camera, piecewise.
+    Returns: [H, W, 4] in [0, 1], mean about 1/2; where a surface is seen at a grazing angle cells are larger, so that
+        they do not vanish between pixels. Off the mask the outline's noise goes on for some pixels, as far as a line
+        that straddles it is wide, and beyond them it is noise on the plane of mean depth.
+    Gradient: with respect to position and camera, piecewise; none through normals.
     Errors: ValueError for shapes that disagree and numbers out of range.
     """
     check_type("gbuffer", gbuffer, GBuffer)
@@ -61,8 +67,31 @@ def _surface_noise(gbuffer, camera, size, *, seed):
     px, py = jnp.where(good, position[0], x) - view[0, 3], jnp.where(good, position[1], y) - view[1, 3]
     pz = z - view[2, 3]
     place = [view[0, i] * px + view[1, i] * py + view[2, i] * pz for i in range(3)]
-    cell = size * jnp.abs(2 * scale / (h * projection[1, 1]))
-    return jnp.stack([_zoomed(place, cell, seed * CHANNELS + channel) for channel in range(CHANNELS)], axis=-1)
+    facing = lax.stop_gradient(jnp.where(good & jnp.isfinite(gbuffer.normal[..., 2]), gbuffer.normal[..., 2], 1))
+    cell = size * jnp.abs(2 * scale / (h * projection[1, 1])) / jnp.clip(facing, _GRAZING, 1)
+    noise = jnp.stack([_zoomed(place, cell, seed * CHANNELS + channel) for channel in range(CHANNELS)])
+    return jnp.moveaxis(stored(unknown_truth(gbuffer.position), _continued, noise, good), 0, -1)
+
+
+def _continued(noise, good):
+    """The planes with those values off the mask that lie within `_BEYOND` pixels of it replaced by means of what is
+    nearest to them on it."""
+
+    def grow(_, state):
+        known, noise = state
+        total = _around(jnp.concatenate([known, known * noise]))
+        new = jnp.where(known > 0, noise, jnp.where(total[:1] > 0, total[1:] / jnp.maximum(total[:1], 1), noise))
+        return jnp.where(total[:1] > 0, 1.0, known).astype(noise.dtype), new
+
+    known = good[None].astype(noise.dtype)
+    return lax.fori_loop(0, _BEYOND, grow, (known, noise))[1]
+
+
+def _around(planes):
+    """Sums over 3 x 3 pixels."""
+    for axis in (1, 2):
+        planes = planes + shift(planes, 1, axis) + shift(planes, -1, axis)
+    return planes
 
 
 def _zoomed(place, cell, seed: int):

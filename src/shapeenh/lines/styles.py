@@ -21,20 +21,21 @@ _HEIGHTS = {
     "inflection": (0.02, 0.15),
 }
 _PER_PIXEL = {"luminance": 1, "ridge": 1, "valley": 1, "inflection": 2}
-_WARM, _COOL, _LIGHT = (0.22, 0.06, 0.02), (0.02, 0.03, 0.09), (1.0, 0.97, 0.9)
+_WARM, _COOL, _SEPIA, _LIGHT = (0.22, 0.06, 0.02), (0.02, 0.03, 0.09), (0.08, 0.03, 0.015), (1.0, 0.97, 0.9)
 
 _COMMON = {
     "ink": Brush(radius=1.2, flow=3.5),
-    "pencil": Brush(color=(0.05, 0.05, 0.06), radius=1.1, flow=3.2, paper=0.6, wobble=0.7, tint=0.2),
-    "airbrush": Brush(color=_WARM, radius=3.5, width=1.0, spread=0.5, flow=1.4),
+    "pencil": Brush(color=(0.05, 0.05, 0.06), radius=1.3, flow=3.6, paper=0.6, wobble=0.7, tint=0.2, uneven=0.4),
+    "airbrush": Brush(color=_SEPIA, radius=3.5, width=1.0, spread=0.5, flow=1.4),
     "charcoal": Brush(color=(0.03, 0.025, 0.02), radius=2.6, width=1.0, spread=0.2, flow=2.5, paper=0.6, grow=0.6),
     "calligraphy": Brush(color=_COOL, radius=2.6, aspect=0.45, flow=3.5, grow=0.8),
     "dashes": Brush(radius=1.4, flow=3.5, gaps=1.0),
-    "shaded": Brush(radius=2.0, flow=3.0, shade=0.85),
+    "shaded": Brush(radius=1.8, flow=3.0, shade=0.4),
 }
 _CHANGES: dict[tuple[str, str], dict[str, Any]] = {
-    ("airbrush", "ridge"): {"color": _LIGHT},
+    ("airbrush", "ridge"): {"color": _LIGHT, "radius": 2.5, "spread": 0.3, "flow": 0.6},
     ("airbrush", "occlusion"): {"radius": 1.8, "spread": 0.0, "flow": 2.5},
+    ("shaded", "ridge"): {"color": _LIGHT, "shade": 0.6, "flow": 1.5},
     ("charcoal", "ridge"): {"radius": 1.6, "flow": 1.2},
     ("calligraphy", "ridge"): {"color": _WARM, "radius": 1.8},
     ("dashes", "occlusion"): {"gaps": 0.0},
