@@ -38,18 +38,18 @@ class Model(NamedTuple):
         return 3 if self.glossy else 1
 
 
-COEFFICIENTS = ("one", "x", "y", "z", "xx", "xy", "yy", "w")
+COEFFICIENTS = ("one", "x", "y", "z", "xx", "xy", "yy", "w", "v")
 
 
 def coefficients(direction):
-    """[N, 3] unit directions to the [N, 8] light coefficients of the forms."""
+    """[N, 3] unit directions to the [N, 9] light coefficients of the forms: w = 1 + l_z, and v = (w/2)^-1/2, known once
+    per light instead of divided by at every pixel."""
     x, y, z = direction[:, 0], direction[:, 1], direction[:, 2]
-    # w = 1 + l_z without cancellation below the horizon; never 0, so that the light in -z, which no pixel sees, is
-    # finite.
+    # Without cancellation below the horizon; never 0, so that the light in -z, which no pixel sees, is finite.
     below = z < 0
     w = jnp.where(below, (x * x + y * y) / jnp.where(below, 1 - z, 1), 1 + z)
     w = jnp.maximum(w, 1e-12)
-    return jnp.stack([jnp.ones_like(x), x, y, z, x * x, 2 * x * y, y * y, w], axis=-1)
+    return jnp.stack([jnp.ones_like(x), x, y, z, x * x, 2 * x * y, y * y, w, lax.rsqrt(0.5 * w)], axis=-1)
 
 
 def terms(model: Model) -> dict[str, tuple[tuple[str, str], ...]]:
@@ -160,10 +160,11 @@ def scaling(gain, delta, invariant):
 
 
 class Meeting(NamedTuple):
-    """Cosines of a pixel and a light: n.l (0 where either partner of the light is behind the surface), e.h, n.h, j."""
+    """Cosines of a pixel and a light: n.l (0 where either partner of the light is behind the surface), e.h, n.h; j."""
 
     cos_light: jax.Array
     half_view: jax.Array
+    inverse: jax.Array  # 1/(e.h)
     cos_half: jax.Array
     j: jax.Array
     square: jax.Array  # t^2 = 1/(w^2 + |T p'|^2)
@@ -171,7 +172,7 @@ class Meeting(NamedTuple):
 
 def meet(model: Model, form: dict, light: dict) -> Meeting:
     """The geometry of `weights`."""
-    cos_view, w = form["cos_view"], light["w"]
+    cos_view, w, v = form["cos_view"], light["w"], light["v"]
     tiny = np.finfo(cos_view.dtype).tiny ** 0.25
     if model.warped:
         m = w * w + form["stretch"]
@@ -179,17 +180,16 @@ def meet(model: Model, form: dict, light: dict) -> Meeting:
         square = t * t
         cos_light = square * (2 * w * form["tilt"] + cos_view * (w * w - form["stretch"]))
         cos_light = jnp.where((cos_light > 0) & (form["facing"] > 0), cos_light, 0)
-        half_view, inverse = w * t, m * t / w
+        half_view, inverse = w * t, (0.5 * v * v) * (m * t)
         q = 2 * w * square
         j = q * q
     else:
         cos_light = jnp.maximum(form["cos_light"], 0)
         square = j = jnp.ones_like(w)
-        half_view = jnp.sqrt(0.5 * w)
-        inverse = 1 / half_view
+        half_view, inverse = 0.5 * w * v, v
     # h = (l + e)/|l + e| and |l + e| = 2 e.h, so n.h = (n.l + n.e)/(2 e.h).
     cos_half = jnp.maximum(0.5 * (cos_light + cos_view) * inverse, tiny)
-    return Meeting(cos_light, half_view, cos_half, j, square)
+    return Meeting(cos_light, half_view, inverse, cos_half, j, square)
 
 
 def weights(model: Model, form: dict, light: dict, log=None):
@@ -206,7 +206,7 @@ def weights(model: Model, form: dict, light: dict, log=None):
     tiny = np.finfo(log.dtype).tiny ** 0.25
     # The larger cosine is at least n.e; at n.e = 0 an unlit pixel would divide 0 by 0.
     top = jnp.maximum(jnp.maximum(at.cos_light, form["cos_view"]), tiny)
-    specular = exponential(jnp.minimum(form["shininess"] * log, 0)) * lit / (at.half_view * top)
+    specular = exponential(jnp.minimum(form["shininess"] * log, 0)) * lit * at.inverse / top
     if model.scaled:
         specular = specular * scaling(gain_specular, jnp.minimum(at.cos_half, 1), form["invariant"])
     return diffuse, specular, specular * _fifth(1 - at.half_view)
@@ -316,11 +316,12 @@ def adjoint(model: Model, form: dict, light: dict, log, given, along):
     # The geometry.
     if not model.warped:
         bar["cos_light"], bar["cos_view"] = light_bar, view_bar
-        return bar, 0.5 * log_half_view / w
+        return bar, 0.25 * log_half_view * light["v"] ** 2
     log_t = log_half_view + 4 * log_j + 2 * cos_light * light_bar
     stretch = form["stretch"]
     bar["tilt"] = 2 * w * at.square * light_bar
     bar["stretch"] = -at.square * (cos_view * light_bar + 0.5 * log_t)
     bar["cos_view"] = view_bar + (w * w - stretch) * at.square * light_bar
-    w_bar = at.square * (2 * light_bar * (form["tilt"] + cos_view * w) - w * log_t) + (log_half_view + 2 * log_j) / w
+    w_bar = at.square * (2 * light_bar * (form["tilt"] + cos_view * w) - w * log_t)
+    w_bar = w_bar + 0.5 * (log_half_view + 2 * log_j) * light["v"] ** 2
     return bar, w_bar
