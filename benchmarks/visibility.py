@@ -81,11 +81,11 @@ def rows_of(name: str, mesh: se.Mesh, size: str) -> list[dict]:
 
 def conclude(rows: list[dict]) -> str:
     ours = [r for r in rows if r["by"] == OURS]
+    off, off_rounded = (100 * max(r[key] for r in ours) for key in ("wrong", "wrong, corners rounded"))
     said = (
-        f"Default: ours. At {100 * max(r['wrong'] for r in ours):.2g} % of the pixels another face is seen than by exact "
-        f"geometry, because corners are rounded to 1/{SUB} px; at "
-        f"{100 * max(r['wrong, corners rounded'] for r in ours):.2g} % another one than with corners so rounded, because "
-        "they are made in float32."
+        f"Default: ours. At {off:.2g} % of the pixels another face is seen than by exact geometry, because corners are "
+        f"rounded to 1/{SUB} px; at {off_rounded:.2g} % another one than with corners so rounded, as they are made "
+        "in float32."
     )
     for who in dict.fromkeys(r["by"] for r in rows if r["by"] != OURS):
         theirs = [r for r in rows if r["by"] == who]
