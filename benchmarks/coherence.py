@@ -1,10 +1,12 @@
 """Temporal coherence of lines: `python -m benchmarks.coherence [MESH] [--frames 12] [--height 400]`.
 
-A slow turntable and a slow zoom. Each picture of lines is warped to the next frame by the exact motion of the surface
-(positions of the G-buffer, reprojected; pixels that were hidden do not count), and compared with what is drawn there.
-Popping is the ink that appeared or vanished, as a fraction of all ink; `change` counts all of it (a part of which is
-the bilinear warp of lines two pixels wide), `pops` what changed by more than half. Beside our lines (TH10 7.2, 8.1)
-stand the pixels whose curvature exceeds a threshold (as much ink in the first frame), hard and soft.
+A slow turntable and a slow zoom, of the mesh and of the mesh with noise. Each picture of lines is warped to the next
+frame by the exact motion of the surface (positions of the G-buffer, reprojected; pixels that were hidden do not count),
+and compared with what is drawn there. Popping is the ink that appeared or vanished, as a fraction of all ink; `change`
+counts all of it (a part of which is the bilinear warp of lines two pixels wide), `pops` what changed by more than half.
+Beside our lines (TH10 7.2, 8.1) stand the pixels whose curvature exceeds a threshold (as much ink in the first frame),
+hard and soft. Then the noisy mesh from farther and farther away (TH10 fig. 7.4): how many strokes there are, how much
+of the ink is specks, and how much of the clean mesh's ink is found where it was.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import ndimage
 
 import shapeenh as se
 from benchmarks import harness
@@ -26,19 +29,21 @@ STYLES = ("lines, ink", "lines, pencil", "thresholded curvature", "softly thresh
 # ------------------------------------------------------------------------------------------- motion
 
 
-def cameras(mesh, motion: str, frames: int, aspect: float) -> list:
-    """A turntable of half a degree per frame, or a zoom of 1.5 % per frame."""
+def turned(mesh, degrees: float, aspect: float, *, away: float = 1.0):
+    """A camera that sees the whole mesh, turned around it, that many times as far away."""
     low, high = np.asarray(mesh.vertices.min(axis=0)), np.asarray(mesh.vertices.max(axis=0))
     centre, radius = 0.5 * (low + high), 0.5 * np.linalg.norm(high - low)
-    found = []
-    for k in range(frames):
-        a = np.deg2rad(0.5 * k) if motion == "turntable" else 0.0
-        x, y, z = DIRECTION
-        direction = np.array([np.cos(a) * x + np.sin(a) * z, y, np.cos(a) * z - np.sin(a) * x])
-        distance = radius * 3.6 * (1.015**-k if motion == "zoom" else 1)
-        eye = centre + distance * direction / np.linalg.norm(direction)
-        found.append(se.perspective_camera(eye, centre, fov_degrees=30.0, aspect=aspect))
-    return found
+    a, (x, y, z) = np.deg2rad(degrees), DIRECTION
+    direction = np.array([np.cos(a) * x + np.sin(a) * z, y, np.cos(a) * z - np.sin(a) * x])
+    eye = centre + 3.6 * radius * away * direction / np.linalg.norm(direction)
+    return se.perspective_camera(eye, centre, fov_degrees=30.0, aspect=aspect)
+
+
+def cameras(mesh, motion: str, frames: int, aspect: float) -> list:
+    """A turntable of half a degree per frame, or a zoom of 1.5 % per frame."""
+    if motion == "turntable":
+        return [turned(mesh, 0.5 * k, aspect) for k in range(frames)]
+    return [turned(mesh, 0.0, aspect, away=1.015**-k) for k in range(frames)]
 
 
 @jax.jit
@@ -126,13 +131,58 @@ def popping(mesh, motion: str, frames: int, height: int) -> dict[str, list[dict]
     return rows
 
 
+# ------------------------------------------------------------------------------------------- noise on the mesh
+
+
+def roughened(mesh, share: float = 0.001):
+    """The mesh with its vertices moved along their normals at random, by this share of its size (one sigma)."""
+    vertices, normals = np.asarray(mesh.vertices), np.asarray(mesh.normals)
+    size = np.linalg.norm(np.ptp(vertices, axis=0))
+    moved = vertices + share * size * np.random.default_rng(0).normal(size=(len(vertices), 1)) * normals
+    return se.make_mesh(np.float32(moved), np.asarray(mesh.faces))
+
+
+def agglomeration(mesh, noisy, height: int) -> list[dict]:
+    """From 1 to 8 times the distance: strokes, specks and agreement of the noisy mesh's lines, ours and thresholded."""
+    width, rows, levels = height * 4 // 3, [], None
+    brush = se.style_brush("ink", "valley", height=600)
+    for times in (1, 2, 4, 8):
+        inks: dict[str, list] = {"lines, ink": [], "thresholded curvature": []}
+        for m in (mesh, noisy):
+            camera = turned(mesh, 0.0, width / height, away=times)
+            gbuffer = se.render_gbuffer(m, camera, height=height, width=width)
+            descriptor = se.describe(gbuffer, sigma=2.0)
+            levels = levels or level_of_same_ink(gbuffer, descriptor, camera)
+            field = se.line_field("valley", gbuffer, descriptor)
+            profile = se.fit_profile(field, least=float(brush.low))
+            strokes = se.draw_lines(profile, field, brush, gbuffer=gbuffer, descriptor=descriptor)
+            inks["lines, ink"].append(np.asarray(strokes[..., 3]) > 0.5)
+            curvature = np.asarray(curvatures(descriptor)["valley"])
+            inks["thresholded curvature"].append(np.asarray(gbuffer.mask) & (curvature > levels["valley"]))
+        for name, (clean, rough) in inks.items():
+            labels, count = ndimage.label(rough, np.ones((3, 3)))
+            area = np.bincount(labels.ravel())[1:]
+            near = ndimage.binary_dilation(rough, np.ones((3, 3)))
+            rows.append(
+                {
+                    "distance": times,
+                    "method": name,
+                    "strokes": int(count),
+                    "strokes, clean": int(ndimage.label(clean, np.ones((3, 3)))[1]),
+                    "in specks": float(area[area < 12].sum() / max(area.sum(), 1)),
+                    "found again": float(near[clean].mean()) if clean.any() else 1.0,
+                }
+            )
+    return rows
+
+
 def plot(results: dict, path) -> None:
     try:
         from matplotlib.figure import Figure
     except ImportError:
         print("no plot: matplotlib is missing (pip install shapeenh[bench])")
         return
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    figure = Figure(figsize=(3.6 * len(results), 3.6), layout="constrained")
     for axes, (motion, rows) in zip(figure.subplots(1, len(results), sharey=True), results.items(), strict=True):
         for name, frames in rows.items():
             axes.plot(range(1, len(frames) + 1), [100 * f["change"] for f in frames], "o-", markersize=3, label=name)
@@ -150,7 +200,12 @@ def main() -> None:
     arguments = parser.parse_args()
     path = arguments.mesh or harness.data("armadillo.obj")
     mesh = se.load_mesh(path) if path else se.carved_knot()
-    results = {m: popping(mesh, m, arguments.frames, arguments.height) for m in ("turntable", "zoom")}
+    noisy = roughened(mesh)
+    results = {
+        motion + suffix: popping(m, motion, arguments.frames, arguments.height)
+        for m, suffix in ((mesh, ""), (noisy, ", noise"))
+        for motion in ("turntable", "zoom")
+    }
     rows = []
     for motion, methods in results.items():
         for name, frames in methods.items():
@@ -158,11 +213,10 @@ def main() -> None:
             mean = {key: float(np.mean(numbers)) for key, numbers in found.items()}
             rows.append({"motion": motion, "method": name, **mean, "worst change": max(found["change"])})
     print(harness.table(rows))
-    print(
-        harness.write(
-            "coherence", rows, mesh=Path(path).stem if path else "knot", frames=arguments.frames, per_frame=results
-        )
-    )
+    far = agglomeration(mesh, noisy, arguments.height)
+    print(harness.table(far))
+    facts = {"mesh": Path(path).stem if path else "knot", "frames": arguments.frames}
+    print(harness.write("coherence", rows, **facts, per_frame=results, distances=far))
     plot(results, harness.RESULTS / "coherence.png")
 
 

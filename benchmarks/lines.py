@@ -1,7 +1,9 @@
 """Lines, stage by stage: `python -m benchmarks.lines [MESH ...] [--size WxH] [--kind KIND]`.
 
-Warm medians, compile apart. TH10 8.4 reports 56 frames per second (18 ms) for one kind of line at 1024 x 768 with a
-footprint of 10 px and 10 diffusion steps, on its GPU (82 without diffusion). Ten steps of 1/5 are sigma = 2 here.
+Warm medians, compile apart; then the same from farther and farther away, where fewer pixels are near lines, in an image
+of the same size; then straight lines, more and more of them, with footprints of several sizes. TH10 8.4 reports 56
+frames per second (18 ms) for one kind of line at 1024 x 768 with a footprint of 10 px and 10 diffusion steps, on its GPU
+(82 without diffusion). Ten steps of 1/5 are sigma = 2 here.
 """
 
 from __future__ import annotations
@@ -16,11 +18,19 @@ from benchmarks import harness
 
 THESIS_MS = 1000 / 56
 SIGMA = 2.0
+DIRECTION = np.array([0.34, 0.26, 0.90])
 
 
-def stages(mesh, kind: str, *, width: int, height: int) -> tuple[dict, dict]:
-    """The calls that make the lines of one frame, each on the finished results of those before it."""
-    camera = se.frame_mesh(mesh, direction=(0.34, 0.26, 0.90), aspect=width / height)
+def stages(mesh, kind: str, *, width: int, height: int, away: float = 1.0) -> tuple[dict, dict]:
+    """The calls that make the lines of one frame, each on the finished results of those before it.
+
+    away: how many times as far from the mesh as where it fills the image.
+    """
+    camera = se.frame_mesh(mesh, direction=DIRECTION, aspect=width / height)
+    if away > 1:
+        low, high = np.asarray(mesh.vertices.min(axis=0)), np.asarray(mesh.vertices.max(axis=0))
+        eye = 0.5 * (low + high) + 1.8 * away * np.linalg.norm(high - low) * DIRECTION / np.linalg.norm(DIRECTION)
+        camera = se.perspective_camera(eye, 0.5 * (low + high), fov_degrees=30.0, aspect=width / height)
     gbuffer = se.render_gbuffer(mesh, camera, height=height, width=width)
     descriptor = se.describe(gbuffer)
     style = se.style_brush("ink", kind, height=height)
@@ -33,16 +43,36 @@ def stages(mesh, kind: str, *, width: int, height: int) -> tuple[dict, dict]:
         field = se.line_field(kind, gbuffer, descriptor, sigma=SIGMA)
         return se.draw_lines(se.fit_profile(field, least=least), field, brush)
 
+    sheets = {"gbuffer": gbuffer, "descriptor": descriptor}
     calls = {
         "field, 10 diffusion steps": lambda: se.line_field(kind, gbuffer, descriptor, sigma=SIGMA).height,
         "fit": lambda: se.fit_profile(field, least=least).distance,
         "draw, footprint 10 px": lambda: se.draw_lines(profile, field, brush),
-        "draw, ending at silhouettes": lambda: se.draw_lines(
-            profile, field, brush, gbuffer=gbuffer, descriptor=descriptor
-        ),
+        "draw, ending at silhouettes": lambda: se.draw_lines(profile, field, brush, **sheets),
         "lines: field, fit, draw": frame,
     }
     return calls, {"covered": int(gbuffer.mask.sum()), "near lines": int(np.asarray(profile.valid).sum())}
+
+
+def distances(mesh, kind: str, *, width: int, height: int) -> list[dict]:
+    """The stages with fewer and fewer pixels near lines, in one image size: what is left is what all pixels cost."""
+    calls, facts = {}, {}
+    for away in (1, 2, 4, 8):
+        own, facts[away] = stages(mesh, kind, width=width, height=height, away=away)
+        calls |= {(away, stage): call for stage, call in own.items()}
+    times = harness.measure(calls, repeats=7, seconds=40)
+    return [{"distance": away, "stage": stage, **facts[away], **times[away, stage]} for away, stage in calls]
+
+
+def of_all_pixels(rows: list[dict]) -> dict[str, float]:
+    """Milliseconds of each stage that do not follow the pixels near lines: the straight line through the nearest and
+    the farthest row, at none of them."""
+    found = {}
+    for stage in dict.fromkeys(row["stage"] for row in rows):
+        first, *_, last = (row for row in rows if row["stage"] == stage)
+        slope = (first["min_ms"] - last["min_ms"]) / (first["near lines"] - last["near lines"])
+        found[stage] = round(last["min_ms"] - slope * last["near lines"], 2)
+    return found
 
 
 def scaling(*, size: int = 768) -> list[dict]:
@@ -94,11 +124,15 @@ def main() -> None:
         for stage, times in harness.measure(calls, repeats=9).items():
             rows.append({"mesh": name, "stage": stage, **facts, **times})
     print(harness.table(rows))
+    far = distances(next(iter(meshes.values())), arguments.kind, width=width, height=height)
+    print(harness.table(far))
+    print("ms that do not follow the pixels near lines:", of_all_pixels(far))
     stripes = scaling()
     print(harness.table(stripes))
     print("growth of the cost with the pixels near lines (1 is linear) and with the radius:", growth(stripes))
     print(f"TH10 8.4, its GPU: {THESIS_MS:.1f} ms per frame")
     facts = {"size": arguments.size, "kind": arguments.kind, "thesis_ms": THESIS_MS, "growth": growth(stripes)}
+    facts |= {"of_all_pixels_ms": of_all_pixels(far), "distances": far}
     print(harness.write("lines", [*rows, *stripes], **facts))
 
 
