@@ -18,9 +18,10 @@ import sys
 import time
 from pathlib import Path
 
+from benchmarks import tables
 from benchmarks.harness import RESULTS
 
-NOT_BENCHMARKS = ("__init__", "__main__", "harness")
+NOT_BENCHMARKS = ("__init__", "__main__", "harness", "tables")
 QUICK = {  # options of scripts whose work `harness.measure` does not bound
     "coherence": ["--frames", "2", "--height", "100"],
     "descriptor": ["--quick"],
@@ -93,6 +94,8 @@ def main() -> None:
             failed.append(name)
         print(f"== {name}: {time.perf_counter() - start:.0f} s. {answer(name, folder)}", flush=True)
     print(write_answers(folder))
+    if not arguments.quick:
+        tables.main()
     if failed:
         sys.exit(f"failed: {', '.join(failed)}")
 
