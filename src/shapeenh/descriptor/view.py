@@ -195,10 +195,10 @@ def _describe_all(gbuffer, sigma, foreshortening, importance, degrees, *, smooth
     g = stored(always, gradient.depth_gradient, normal, foreshortening)
 
     # 4-6: diffusion, of the gradient and of the places where it was measured
-    places, bend = None, jnp.ones_like(sigma)
+    places, bend = _coordinates(g), jnp.ones_like(sigma)
     if smoothing is not None:
         budget = _budget(sigma, importance)
-        stacks = (g, _coordinates(g))  # of two planes: four at once overflow the cache
+        stacks = (g, places)  # of two planes: four at once overflow the cache
         levels, sure, chart = smoothing
         g, places = diffusion.diffuse_stacks(stacks, link_x, link_y, budget, c > 0, always, levels=levels, sure=sure)
         bend = jnp.exp(-8 * jnp.max(budget)) if chart else None  # type: ignore[assignment]
@@ -254,10 +254,6 @@ def _hessian(g, places, link_x, link_y, c, foreshortening, bend, always):
             (scale * (d_y[0] + s_y * g[0]), scale * (d_y[1] + s_y * g[1])),
         )
 
-    def plain(g, d_x, d_y, c):
-        (u_x, v_x), (u_y, v_y) = slopes(g, d_x, d_y)
-        return c * u_x, c * (0.5 * (v_x + u_y)), c * v_y
-
     def displaced(g, d_x, d_y, x, y, c):
         """H = J^T (J J^T + e^2)^-1 (g_x; g_y), least squares with a floor, J = (x_x y_x; x_y y_y)."""
         (u_x, v_x), (u_y, v_y) = slopes(g, d_x, d_y)
@@ -271,6 +267,4 @@ def _hessian(g, places, link_x, link_y, c, foreshortening, bend, always):
 
     planes = tuple(g) if bend is None else stored(always, lambda g: gradient.to_chart(g, foreshortening, bend), g)
     d = derivatives(planes, link_x, link_y, always)
-    if places is None:
-        return stored(always, plain, g, *d, c)
     return stored(always, displaced, g, *d, *derivatives(tuple(places), link_x, link_y, always), c)
