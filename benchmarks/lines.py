@@ -2,8 +2,8 @@
 
 Warm medians, compile apart; then the same from farther and farther away, where fewer pixels are near lines, in an image
 of the same size; then straight lines, more and more of them, with footprints of several sizes. TH10 8.4 reports 56
-frames per second (18 ms) for one kind of line at 1024 x 768 with a footprint of 10 px and 10 diffusion steps, on its GPU
-(82 without diffusion). Ten steps of 1/5 are sigma = 2 here.
+frames per second (18 ms) for one kind of line at 1024 x 768 with a footprint of 10 px and 10 diffusion steps, on its
+GPU (82 without diffusion). Ten steps of 1/5 are sigma = 2 here.
 """
 
 from __future__ import annotations

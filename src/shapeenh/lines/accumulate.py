@@ -83,12 +83,20 @@ def _near(flags: np.ndarray, reach: int) -> np.ndarray:
     """[H, runs per row]: which runs have a flag within `reach` rows and columns."""
     h, w = flags.shape
     runs = -(-w // LANES)
-    block = np.pad(flags, ((0, 0), (0, runs * LANES - w))).reshape(h, runs, LANES)
+    near = np.zeros((h, runs), bool)
+    used = np.flatnonzero(flags.any(axis=1))
+    if not used.size:
+        return near
+    first, last = int(used[0]), int(used[-1]) + 1  # all other rows are empty
+    block = np.pad(flags[first:last], ((0, 0), (0, runs * LANES - w))).reshape(last - first, runs, LANES)
     any_ = np.asarray(block.any(axis=2))
     any_[:, 1:] |= block[:, :-1, -reach:].any(axis=2)
     any_[:, :-1] |= block[:, 1:, :reach].any(axis=2)
-    total = np.cumsum(np.pad(any_, ((reach + 1, reach), (0, 0))), axis=0)
-    return total[2 * reach + 1 :] > total[: -2 * reach - 1]
+    total = np.cumsum(np.pad(any_, ((2 * reach + 1, 2 * reach), (0, 0))), axis=0)
+    wide = total[2 * reach + 1 :] > total[: -2 * reach - 1]
+    top, bottom = max(first - reach, 0), min(last + reach, h)
+    near[top:bottom] = wide[top - first + reach : bottom - first + reach]
+    return near
 
 
 # ------------------------------------------------------------------------------------------- the sum (8.1)

@@ -25,7 +25,7 @@ from shapeenh.types import Descriptor, GBuffer, LineField, Profile
 
 LARGEST_REACH = 64
 NOISY = ("paper", "gaps", "tint", "wobble", "uneven", "twist")  # what of a brush needs noise
-_LADDER = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, 32, 48, 64)
+_LADDER = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, 32, 48, 64)
 
 
 @register_dataclass
@@ -125,7 +125,7 @@ def draw_lines(
     _check_brush(brush, shading, noise)
     barriers = _barriers(gbuffer, descriptor, shape)
     image, function = _footprint(footprint, dtype)
-    reach = _reach(brush, reach, corners=function not in FOOTPRINTS)
+    reach = _reach(brush, reach, function)
     concrete = is_concrete(profile, field, brush, shading, noise, image, barriers)
     wants = _wants(brush, shading, noise, function) if concrete else {}
     brush = Brush(**{name: jnp.asarray(value, dtype) for name, value in vars(brush).items()})
@@ -205,13 +205,17 @@ def _footprint(footprint, dtype):
     return jnp.asarray(footprint, dtype), "image"
 
 
-def _reach(brush, reach, *, corners: bool) -> int:
+def _reach(brush, reach, function) -> int:
     if reach is not None:
         return next(r for r in _LADDER if r >= check_size("reach", reach, high=LARGEST_REACH))
-    if not is_concrete(brush.radius, brush.wobble):
+    if not is_concrete(brush.radius, brush.wobble, brush.aspect):
         raise ValueError("reach is None with a traced brush; accepted is a number of px, since it decides array sizes")
-    # the corner of a turned square lies sqrt(2) times as far away, and anti-aliasing adds half a pixel
-    needed = (np.sqrt(2) if corners else 1) * float(brush.radius) + float(brush.wobble) + 0.5
+    radius, wobble = float(brush.radius), float(brush.wobble)
+    if function in FOOTPRINTS:  # 0 from this far on, anti-aliasing included
+        end = radius + wobble + 0.5 / (1 if function == "disc" else float(brush.aspect))
+        needed = int(np.ceil(end)) - 1
+    else:  # the corner of a turned square
+        needed = int(np.sqrt(2) * radius + wobble)
     return next((r for r in _LADDER if r >= needed), LARGEST_REACH)
 
 
