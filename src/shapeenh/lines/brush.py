@@ -10,6 +10,7 @@ T_x a similarity that orients and scales it. Sums are premultiplied RGBA; 1 - ex
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -128,7 +129,9 @@ def draw_lines(
     reach = _reach(brush, reach, function)
     concrete = is_concrete(profile, field, brush, shading, noise, image, barriers)
     wants = _wants(brush, shading, noise, function) if concrete else {}
-    brush = Brush(**{name: jnp.asarray(value, dtype) for name, value in vars(brush).items()})
+    # one by one, JAX's arrays take as long to make as a small picture takes to draw
+    array: Any = np.asarray if is_concrete(brush) else jnp.asarray
+    brush = Brush(**{name: array(value, dtype) for name, value in vars(brush).items()})
     options = {"function": function, "reach": reach}
     if not concrete:
         return draw_everywhere(profile, field, brush, shading, noise, image, barriers, **options)

@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 
 from shapeenh.checks import check_choice, check_range, check_shape, check_type, float_dtype, is_concrete
-from shapeenh.fusion import unknown_truth
+from shapeenh.fusion import stored, unknown_truth
 from shapeenh.lines.smoothing import LEAST_HEIGHT, prepare, smoothed_field
 from shapeenh.lines.tiles import list_tiles, over_tiles
 from shapeenh.numerics import safe_divide, safe_hypot, smoothstep
@@ -254,7 +254,12 @@ _MARGIN = 8
 
 @jax.jit
 def _tiled_barriers(surface, tiles):
-    return over_tiles(_barriers, surface, tiles, (False, False), margin=_MARGIN)
+    always = unknown_truth(surface[1])
+
+    def barriers(surface):  # what is cut out is stored, or every neighbour that the stencils read is cut out again
+        return _barriers(stored(always, lambda surface: surface, surface))
+
+    return over_tiles(barriers, surface, tiles, (False, False), margin=_MARGIN)
 
 
 @jax.jit

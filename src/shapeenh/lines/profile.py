@@ -99,9 +99,11 @@ def _high(field, least):
 
 @partial(jax.jit, static_argnames=("margin", "radius"))
 def _tiled(field, least, tiles, *, margin, radius):
+    always = unknown_truth(field.height, least)
+
     def look(field):
-        planes = _planes(field)
-        return *planes, *_candidates(planes, least, radius=radius)
+        planes = stored(always, _planes, field)
+        return *planes, *stored(always, partial(_candidates, radius=radius), planes, least)
 
     return over_tiles(look, field, tiles, (0, 1, 0, 0, False, False), margin=margin)
 
