@@ -125,22 +125,28 @@ def _forms(model: kernel.Model, planes, light):
 
 
 def _weights(model: kernel.Model, on, planes, rows):
-    """(log(n.h), the weights), each (block, light, 64) and stored.
+    """(What the weights and their derivatives have in common, the weights), each (block, light, 64) and stored.
 
-    The logarithm apart: one kernel for it and one for the rest keep fewer values alive than a single one, and take a
-    tenth less time.
+    What they have in common apart: a root and a logarithm once instead of in every kernel that needs them, and kernels
+    that keep fewer values alive, take a tenth less time.
     """
 
-    def log(planes, rows):
+    def root(planes, rows):
         light, _ = _unpack(rows)
-        return kernel.logarithm(kernel.meet(model, _forms(model, planes, light), light).cos_half)
+        return kernel.root(_forms(model, planes, light), light)
 
-    def weigh(planes, rows, log):
+    def log(planes, rows, known):
         light, _ = _unpack(rows)
-        return kernel.weights(model, _forms(model, planes, light), light, log)
+        return kernel.logarithm(kernel.meet(model, _forms(model, planes, light) | known, light).cos_half)
 
-    logarithm = stored(on, log, planes, rows) if model.glossy else None
-    return logarithm, stored(on, weigh, planes, rows, logarithm)
+    def weigh(planes, rows, known):
+        light, _ = _unpack(rows)
+        return kernel.weights(model, _forms(model, planes, light) | known, light)
+
+    known = {"root": stored(on, root, planes, rows)} if model.warped else {}
+    if model.glossy:
+        known = known | {"log": stored(on, log, planes, rows, known)}
+    return known, stored(on, weigh, planes, rows, known)
 
 
 def _add_weighted(total, weight, colour):
@@ -158,12 +164,16 @@ class _Walk(NamedTuple):
     total: jax.Array
     low: jax.Array
     high: jax.Array
-    group: int
+
+
+def _group(plan: Plan, mask) -> int:
+    """Blocks per step, of a padded mask."""
+    return min(plan.group, mask.size // blocks.PIXELS)
 
 
 def _plan_walk(plan: Plan, mask, normal, table, count) -> _Walk:
     covered = jnp.any(blocks.tiled(mask), axis=(1, 3)).reshape(-1)
-    group = min(plan.group, covered.shape[0])
+    group = _group(plan, mask)
     ids, total = blocks.listed(jnp.zeros(covered.shape, jnp.int32), covered, group)
 
     def box(i, found):
@@ -184,7 +194,7 @@ def _plan_walk(plan: Plan, mask, normal, table, count) -> _Walk:
 
     work = lax.fori_loop(0, count, count_light, jnp.zeros(ids.shape, jnp.int32))
     order, _ = blocks.listed(work, lax.iota(jnp.int32, ids.shape[0]) < total, group)
-    return _Walk(ids[order], total, low[:, order], high[:, order], group)
+    return _Walk(ids[order], total, low[:, order], high[:, order])
 
 
 def _read_inputs(inputs, mask, ids):
@@ -210,16 +220,16 @@ def _plane_array(plan: Plan, on, inputs):
 
 
 def _forward(plan: Plan, mask, inputs, direction, radiance, count, *, keep=False):
-    """The image, and with `keep` the sums of all blocks in the order of the walk, (block, 3 * components, 64)."""
+    """The image, the walk, and with `keep` the sums of all blocks in its order, (block, 3 * components, 64)."""
     height, width = mask.shape
     mask, inputs = blocks.padded(mask), {k: blocks.padded(v) if v.ndim >= 2 else v for k, v in inputs.items()}
     table = _light_table(direction, radiance, ladder(direction.shape[0], plan.chunk))
-    walk = _plan_walk(plan, mask, inputs["normal"], table, count)
+    walk, group = _plan_walk(plan, mask, inputs["normal"], table, count), _group(plan, mask)
     on = walk.total >= 0
 
     def step(i, state):
         image, kept = state
-        ids = lax.dynamic_slice_in_dim(walk.ids, i * walk.group, walk.group)
+        ids = lax.dynamic_slice_in_dim(walk.ids, i * group, group)
         found, valid = stored(on, lambda ids: _read_inputs(inputs, mask, ids), ids)
         planes, rest = stored(on, lambda found: _plane_array(plan, on, found), found)
 
@@ -228,18 +238,18 @@ def _forward(plan: Plan, mask, inputs, direction, radiance, count, *, keep=False
             _, weight = _weights(plan.model, on, planes, rows)
             return tuple(_add_weighted(*pair, colour) for pair in zip(sums, weight, strict=True))
 
-        zero = jnp.zeros((walk.group, 3, blocks.PIXELS), planes.dtype)
-        box = tuple(lax.dynamic_slice_in_dim(a, i * walk.group, walk.group, axis=1) for a in (walk.low, walk.high))
+        zero = jnp.zeros((group, 3, blocks.PIXELS), planes.dtype)
+        box = tuple(lax.dynamic_slice_in_dim(a, i * group, group, axis=1) for a in (walk.low, walk.high))
         sums = _light_loop(plan, box, table, count, body, (zero,) * plan.model.components)
         if keep:
-            kept = lax.dynamic_update_slice_in_dim(kept, jnp.concatenate(sums, axis=1), i * walk.group, axis=0)
+            kept = lax.dynamic_update_slice_in_dim(kept, jnp.concatenate(sums, axis=1), i * group, axis=0)
         image = blocks.write(image, ids, stored(on, lambda *a: jnp.where(valid, plan.epilogue(*a), 0), sums, rest))
         return image, kept
 
     image = jnp.zeros((*mask.shape, 3), radiance.dtype)
     kept = jnp.zeros((walk.ids.shape[0], 3 * plan.model.components, blocks.PIXELS), image.dtype) if keep else None
-    image, kept = lax.fori_loop(0, -(-walk.total // walk.group), step, (image, kept))
-    return image[:height, :width], kept
+    image, kept = lax.fori_loop(0, -(-walk.total // group), step, (image, kept))
+    return image[:height, :width], walk, kept
 
 
 # ------------------------------------------------------------------------------------------- the adjoint
@@ -257,17 +267,17 @@ def _products(weights, cotangents):
     return total
 
 
-def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, count, kept, cotangent):
-    """Cotangents of the inputs in `wanted`, of "direction" and of "radiance", given that of the image; `kept` are the
-    sums, as `_forward` keeps them, where an input is wanted."""
+def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, count, walk, kept, cotangent):
+    """Cotangents of the inputs in `wanted`, of "direction" and of "radiance", given that of the image; `walk` and
+    `kept` as `_forward` returns them."""
     height, width = mask.shape
     shapes = {name: value.shape for name, value in inputs.items()}
     mask, cotangent = blocks.padded(mask), blocks.padded(cotangent)
     inputs = {k: blocks.padded(v) if v.ndim >= 2 else v for k, v in inputs.items()}
     table = _light_table(direction, radiance, ladder(direction.shape[0], plan.chunk))
-    walk = _plan_walk(plan, mask, inputs["normal"], table, count)
+    group = _group(plan, mask)
     on = walk.total >= 0
-    lane = lax.iota(jnp.int32, walk.group)
+    lane = lax.iota(jnp.int32, group)
     moved = {plane for name, reached in plan.reach if name in wanted for plane in reached}
     names = kernel.planes_of(plan.model)
     pairs = kernel.terms(plan.model)
@@ -278,16 +288,16 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
 
     def step(i, found):
         images, constants, light_bar = found
-        ids = lax.dynamic_slice_in_dim(walk.ids, i * walk.group, walk.group)
+        ids = lax.dynamic_slice_in_dim(walk.ids, i * group, group)
         pixels, valid = stored(on, lambda ids: _read_inputs(inputs, mask, ids), ids)
         # The list's padding repeats a block, whose cotangent counts once: so the repetitions add 0 below.
-        fresh = (i * walk.group + lane < walk.total)[:, None, None]
+        fresh = (i * group + lane < walk.total)[:, None, None]
         given = jnp.where(valid & fresh, blocks.read(cotangent, ids), 0)
         planes, rest = stored(on, lambda pixels: _plane_array(plan, on, pixels), pixels)
-        zero = jnp.zeros((walk.group, 3, blocks.PIXELS), planes.dtype)
+        zero = jnp.zeros((group, 3, blocks.PIXELS), planes.dtype)
         sums = (zero,) * plan.model.components
         if kept is not None:
-            sums = tuple(jnp.split(lax.dynamic_slice_in_dim(kept, i * walk.group, walk.group), len(sums), axis=1))
+            sums = tuple(jnp.split(lax.dynamic_slice_in_dim(kept, i * group, group), len(sums), axis=1))
         # The epilogue is linear in the sums, so their cotangents do not depend on them.
         pull_sums = jax.vjp(lambda *sums: plan.epilogue(sums, rest), *sums)[1]
         sums_bar = stored(on, lambda given: pull_sums(given), given)
@@ -295,17 +305,17 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
         def body(carry, numbers, rows):
             planes_bar, light_bar = carry
             light, _ = _unpack(rows)
-            log, weight = _weights(plan.model, on, planes, rows)
+            known, weight = _weights(plan.model, on, planes, rows)
 
-            def derivatives(planes, rows, log, weight):
+            def derivatives(planes, rows, known, weight):
                 light, colour = _unpack(rows)
-                form = _forms(plan.model, planes, light)
+                form = _forms(plan.model, planes, light) | known
                 along = tuple(sum(bar[:, None, c] * colour[:, :, c, None] for c in range(3)) for bar in sums_bar)
-                bar, w_bar = kernel.adjoint(plan.model, form, light, log, weight, along)
+                bar, w_bar = kernel.adjoint(plan.model, form, light, weight, along)
                 return {name: bar[name] for name in used}, w_bar
 
             if used:
-                forms_bar, w_bar = stored(on, derivatives, planes, rows, log, weight)
+                forms_bar, w_bar = stored(on, derivatives, planes, rows, known, weight)
                 # The planes of a form together: one kernel, and one that is large enough for XLA to share among cores.
                 for form, of_form in reached.items():
                     factors = jnp.stack([light[coefficient][..., 0] for _, coefficient in of_form], axis=-1)
@@ -328,10 +338,8 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
                 light_bar["direction"] = light_bar["direction"].at[numbers].add(table_bar, mode="promise_in_bounds")
             return planes_bar, light_bar
 
-        planes_bar = {
-            form: jnp.zeros_like(zero, shape=(walk.group, len(k), blocks.PIXELS)) for form, k in reached.items()
-        }
-        box = tuple(lax.dynamic_slice_in_dim(a, i * walk.group, walk.group, axis=1) for a in (walk.low, walk.high))
+        planes_bar = {form: jnp.zeros_like(zero, shape=(group, len(k), blocks.PIXELS)) for form, k in reached.items()}
+        box = tuple(lax.dynamic_slice_in_dim(a, i * group, group, axis=1) for a in (walk.low, walk.high))
         planes_bar, light_bar = _light_loop(plan, box, table, count, body, (planes_bar, light_bar))
 
         def finish(pixels, planes_bar, sums, given):
@@ -356,9 +364,7 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
     lights_bar = {
         n: jnp.zeros((table.shape[0], k), dtype) for n, k in (("radiance", 3), ("direction", width_of)) if n in wanted
     }
-    images, constants, lights_bar = lax.fori_loop(
-        0, -(-walk.total // walk.group), step, (images, constants, lights_bar)
-    )
+    images, constants, lights_bar = lax.fori_loop(0, -(-walk.total // group), step, (images, constants, lights_bar))
     bars = {name: image[:height, :width] for name, image in images.items()}
     bars |= {name: jnp.sum(value, axis=1) for name, value in constants.items()}
     if "radiance" in wanted:
@@ -386,16 +392,16 @@ def _shade_image_forward(plan, mask, inputs, direction, radiance, count):
         lambda leaf: leaf.value, (mask, inputs, direction, radiance, count), is_leaf=lambda x: hasattr(x, "perturbed")
     )
     keep = any(name in inputs for name in perturbed)
-    image, kept = _forward(plan, mask, inputs, direction, radiance, count, keep=keep)
-    return image, (mask, inputs, direction, radiance, count, {name: None for name in perturbed}, kept)
+    image, walk, kept = _forward(plan, mask, inputs, direction, radiance, count, keep=keep)
+    return image, (mask, inputs, direction, radiance, count, {name: None for name in perturbed}, walk, kept)
 
 
 def _shade_image_backward(plan, saved, cotangent):
-    mask, inputs, direction, radiance, count, perturbed, kept = saved
+    mask, inputs, direction, radiance, count, perturbed, walk, kept = saved
     nothing = (None, {name: None for name in inputs}, None, None, None)
     if isinstance(cotangent, jax.custom_derivatives.SymbolicZero) or not perturbed:
         return nothing
-    bars = _adjoint(plan, frozenset(perturbed), mask, inputs, direction, radiance, count, kept, cotangent)
+    bars = _adjoint(plan, frozenset(perturbed), mask, inputs, direction, radiance, count, walk, kept, cotangent)
     inputs_bar = {name: bars.get(name) for name in inputs}
     return None, inputs_bar, bars.get("direction"), bars.get("radiance"), None
 

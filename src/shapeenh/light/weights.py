@@ -170,17 +170,21 @@ class Meeting(NamedTuple):
     square: jax.Array  # t^2 = 1/(w^2 + |T p'|^2)
 
 
+def root(form: dict, light: dict):
+    """t = (w^2 + |T p'|^2)^-1/2, of warped models: part of the forms for what follows."""
+    return lax.rsqrt(light["w"] * light["w"] + form["stretch"])
+
+
 def meet(model: Model, form: dict, light: dict) -> Meeting:
     """The geometry of `weights`."""
     cos_view, w, v = form["cos_view"], light["w"], light["v"]
     tiny = np.finfo(cos_view.dtype).tiny ** 0.25
     if model.warped:
-        m = w * w + form["stretch"]
-        t = lax.rsqrt(m)
+        t = form["root"]
         square = t * t
         cos_light = square * (2 * w * form["tilt"] + cos_view * (w * w - form["stretch"]))
         cos_light = jnp.where((cos_light > 0) & (form["facing"] > 0), cos_light, 0)
-        half_view, inverse = w * t, (0.5 * v * v) * (m * t)
+        half_view, inverse = w * t, (0.5 * v * v) * ((w * w + form["stretch"]) * t)
         q = 2 * w * square
         j = q * q
     else:
@@ -192,8 +196,8 @@ def meet(model: Model, form: dict, light: dict) -> Meeting:
     return Meeting(cos_light, half_view, inverse, cos_half, j, square)
 
 
-def weights(model: Model, form: dict, light: dict, log=None):
-    """(A, B, C) of the module's docstring, or (A,); `log` is log(n.h) where it is there already."""
+def weights(model: Model, form: dict, light: dict):
+    """(A, B, C) of the module's docstring, or (A,); of glossy models the forms contain log(n.h)."""
     at = meet(model, form, light)
     lit = at.cos_light * at.j
     diffuse = (1 - _fifth(1 - 0.5 * at.cos_light)) * lit
@@ -202,7 +206,7 @@ def weights(model: Model, form: dict, light: dict, log=None):
         diffuse = diffuse * scaling(gain_diffuse, jnp.minimum(at.cos_light, 1), form["invariant"])
     if not model.glossy:
         return (diffuse,)
-    log = logarithm(at.cos_half) if log is None else log
+    log = form["log"]
     tiny = np.finfo(log.dtype).tiny ** 0.25
     # The larger cosine is at least n.e; at n.e = 0 an unlit pixel would divide 0 by 0.
     top = jnp.maximum(jnp.maximum(at.cos_light, form["cos_view"]), tiny)
@@ -240,7 +244,7 @@ def _scaling_slopes(gain, delta, invariant):
     )
 
 
-def adjoint(model: Model, form: dict, light: dict, log, given, along):
+def adjoint(model: Model, form: dict, light: dict, given, along):
     """Cotangents of the forms and of w, from those of the weights, `along`; `given` are the weights.
 
     By logarithmic derivatives: B is there already, and with P = (B' + C' (1 - e.h)^5) B, primes marking cotangents,
@@ -278,7 +282,7 @@ def adjoint(model: Model, form: dict, light: dict, log, given, along):
         along_specular, along_fresnel = along[1], along[2]
         rest = 1 - at.half_view
         peak = (along_specular + along_fresnel * _fifth(rest)) * given[1]
-        bar["shininess"] = peak * log
+        bar["shininess"] = peak * form["log"]
         half_slope = form["shininess"]  # d log B / d log n.h
         if model.scaled:
             clamped = jnp.minimum(at.cos_half, 1)
