@@ -15,15 +15,11 @@ import numpy as np
 from jax import lax
 
 from shapeenh.checks import check_choice, check_range, check_shape, check_size, check_type, float_dtype, is_concrete
-from shapeenh.fusion import stored, unknown_truth
-from shapeenh.lines.tiles import list_tiles, margin_for, over_tiles
-from shapeenh.numerics import normalize, smoothstep
+from shapeenh.lines.candidates import CHUNK, GAMMA_MAX, list_pixels, looked_at, planes_of, read
+from shapeenh.numerics import smoothstep
 from shapeenh.types import LineField, Profile
 
-GAMMA_MAX = 1.0  # the accumulated singularity that ends a trajectory (TH10 7.2.2)
 LEAST_REACH = 1.0  # px: a neighbourhood narrower than this shows no neighbour on either side, hence no profile
-_OVERSHOOT = 1.3  # a maximum of a cubic fitted to heights within [0, 1] is below 1.28, for 5 to 65 samples
-_CHUNK = 1 << 13
 
 
 def fit_profile(field, *, radius: float = 4.0, samples: int = 9, least=0.0) -> Profile:
@@ -71,94 +67,19 @@ def fit_profile(field, *, radius: float = 4.0, samples: int = 9, least=0.0) -> P
         raise ValueError(f"field.height has shape {(h, w)}; accepted are images of at least one pixel")
     if not is_concrete(field, least):
         return _fit_everywhere(field, least, **options)
-    planes, candidates = _looked_at(field, least, float(radius))
-    listed, counts = _list(*map(np.asarray, candidates))
+    planes, candidates = looked_at(field, least, float(radius))
+    listed, counts = list_pixels(*map(np.asarray, candidates))
     return _fit_listed(planes, listed, counts, least, **options)
-
-
-def _looked_at(field, least, radius):
-    """(what `_planes` and what `_candidates` returns), worked out only near heights that a line can come from."""
-    reach = int(np.ceil(radius)) + 1  # px, how far a fit reads
-    margin = margin_for(reach + 3)
-    tiles = None if margin is None else list_tiles(_high(field, least), margin, around=2 * reach + 3)
-    if tiles is None:
-        planes = _stored_planes(field)
-        return planes, _candidates(planes, least, radius=radius)
-    *planes, possible, held = _tiled(field, least, tiles, margin=margin, radius=radius)
-    return tuple(planes), (possible, held)
-
-
-@jax.jit
-def _high(field, least):
-    """Where a height may make a profile higher than `least`, [H, W] bool.
-
-    Where all are within ±m, those that are extrapolated from them are within ±3 m, and a cubic over both below 5 m.
-    """
-    return (field.singularity < 1) & ((jnp.abs(field.height) > 0.2 * least) | (least <= 0))
-
-
-@partial(jax.jit, static_argnames=("margin", "radius"))
-def _tiled(field, least, tiles, *, margin, radius):
-    always = unknown_truth(field.height, least)
-
-    def look(field):
-        planes = stored(always, _planes, field)
-        return *planes, *stored(always, partial(_candidates, radius=radius), planes, least)
-
-    return over_tiles(look, field, tiles, (0, 1, 0, 0, False, False), margin=margin)
-
-
-def _list(candidates, held):
-    """(pixels [n] int32, chunks [2] int32): first those that no singularity is near, then the others."""
-    size = candidates.size
-    listed = np.full(_CHUNK * (size // _CHUNK + 3), size, np.int32)  # one length per image: nothing recompiles
-    found = np.flatnonzero(candidates)
-    held = held.ravel()[found]
-    free, near = found[~held], found[held]
-    listed[: free.size] = free
-    start = -(-free.size // _CHUNK)
-    listed[start * _CHUNK : start * _CHUNK + near.size] = near
-    return jnp.asarray(listed), jnp.asarray([start, -(-near.size // _CHUNK)], jnp.int32)
 
 
 @partial(jax.jit, static_argnames=("radius", "samples"))
 def _fit_everywhere(field, least, *, radius, samples) -> Profile:
-    planes = _planes(field)
+    planes = planes_of(field)
     h, w = planes[2].shape
     row = jnp.broadcast_to(lax.iota(jnp.int32, h)[:, None], (h, w))
     col = jnp.broadcast_to(lax.iota(jnp.int32, w)[None, :], (h, w))
     theta = planes[2], planes[3]
     return Profile(*_fit(planes, row, col, *theta, least, radius=radius, samples=samples))
-
-
-@partial(jax.jit, static_argnames=("radius",))
-def _candidates(planes, least, *, radius):
-    """(where a profile higher than `least` is possible, where a singularity may end a neighbourhood), [H, W] bool."""
-    h, w = planes[2].shape
-    # A sample lies within ceil(radius) pixels of its pixel, and is read from the four pixels around it.
-    highest = _box(jnp.maximum, planes[0], int(np.ceil(radius)), h, w)
-    lowest = _box(jnp.minimum, planes[0], int(np.ceil(radius)), h, w)
-    # Its cubic stays below lowest + _OVERSHOOT (highest - lowest).
-    possible = (highest > lowest) & (lowest + _OVERSHOOT * (highest - lowest) > least)
-    defined = (planes[2] != 0) | (planes[3] != 0)
-    steps = int(np.ceil(radius))
-    faint = min(0.1, 0.9 * GAMMA_MAX / (steps + 1))  # `_barrier` adds these as they are, and they never add up to 1
-    held = _box(jnp.maximum, planes[1], steps, h, w) > faint
-    return possible & defined & (planes[1][1:-1, 1:-1] < GAMMA_MAX), held
-
-
-def _box(pick, padded, reach: int, h: int, w: int):
-    """The largest (or smallest) value within `reach` pixels, of an image padded by one pixel of its edge."""
-    out = jnp.pad(padded, reach - 1, mode="edge")
-    for axis, size in ((0, h), (1, w)):
-        width = 1
-        while width < 2 * reach + 1:  # windows of 1, 2, 4, ... pixels; the last two overlap
-            step = min(width, 2 * reach + 1 - width)
-            n = out.shape[axis] - step
-            out = pick(lax.slice_in_dim(out, 0, n, axis=axis), lax.slice_in_dim(out, step, step + n, axis=axis))
-            width += step
-        assert out.shape[axis] == size
-    return out
 
 
 @partial(jax.jit, static_argnames=("radius", "samples"))
@@ -169,7 +90,7 @@ def _fit_listed(planes, listed, counts, least, *, radius, samples) -> Profile:
     theta_x, theta_y = theta_x.ravel(), theta_y.ravel()
 
     def chunk(k, out, *, held):
-        index = lax.dynamic_slice_in_dim(listed, k * _CHUNK, _CHUNK)
+        index = lax.dynamic_slice_in_dim(listed, k * CHUNK, CHUNK)
         inside = jnp.minimum(index, h * w - 1)
         theta = theta_x[inside], theta_y[inside]
         found = _fit(planes, inside // w, inside % w, *theta, least, radius=radius, samples=samples, held=held)
@@ -180,68 +101,6 @@ def _fit_listed(planes, listed, counts, least, *, radius, samples) -> Profile:
     out = lax.fori_loop(0, counts[0], partial(chunk, held=False), out)
     out = lax.fori_loop(counts[0], counts[0] + counts[1], partial(chunk, held=True), out)
     return Profile(*(o.reshape(h, w) for o in out))
-
-
-# ------------------------------------------------------------------------------------------- what is read
-
-
-def _planes(field):
-    """(height [H+2, W+2], singularity [H+2, W+2], theta_x [H, W], theta_y [H, W]), finite.
-
-    Where the field is fully singular (off the mask, on the far side of a depth step, beyond the border of the image) a
-    height means nothing, but a bilinear read next to it would mix it in: it is extrapolated from its regular
-    neighbours, linearly, so that no maximum comes from there.
-    """
-
-    def clean(height, direction, singularity):
-        finite = jnp.isfinite(height) & jnp.all(jnp.isfinite(direction), axis=-1)
-        most = 1e-3 * jnp.finfo(height.dtype).max
-        height = jnp.where(finite, jnp.clip(height, -most, most), 0)
-        theta = normalize(jnp.where(finite[..., None], direction, 0))
-        known = finite & ~jnp.isnan(singularity)
-        singular = jnp.where(known, jnp.clip(jnp.where(known, singularity, 0), 0, 1), 1)
-        height, singular = jnp.pad(height, 1), jnp.pad(singular, 1, constant_values=1)
-        regular = 1 - smoothstep(0.5, 1.0, singular)
-        return height, singular, theta[..., 0], theta[..., 1], regular, jnp.pad(height, 2), jnp.pad(regular, 2)
-
-    arrays = field.height, field.direction, field.singularity
-    height, singular, theta_x, theta_y, regular, *around = stored(unknown_truth(*arrays), clean, *arrays)
-    height = regular * height + (1 - regular) * _extrapolated(*around)
-    return height, singular, theta_x, theta_y
-
-
-_stored_planes = jax.jit(_planes)
-
-
-def _extrapolated(height, regular):
-    """2 h(p + d) - h(p + 2d), averaged over those of eight directions d in which both are regular; else h(p + d).
-
-    height, regular: with two more pixels of 0 around them.
-    """
-    h, w = height.shape[0] - 4, height.shape[1] - 4
-    totals = [jnp.zeros((h, w), height.dtype)] * 4
-    for dr, dc in ((r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)):
-        near, far = (np.s_[2 + k * dr : 2 + k * dr + h, 2 + k * dc : 2 + k * dc + w] for k in (1, 2))
-        one = regular[near]
-        both = one * regular[far]
-        values = (one, one * height[near], both, both * (2 * height[near] - height[far]))
-        totals = [total + value for total, value in zip(totals, values, strict=True)]
-    one, first, both, second = totals
-    first = jnp.where(one > 0, first / jnp.where(one > 0, one, 1), 0)
-    return jnp.where(both > 0, second / jnp.where(both > 0, both, 1), first)
-
-
-def _read(plane, row, col):
-    """Bilinear interpolation of a padded plane at positions counted in pixels of the image; clamped to the padding."""
-    h, w = plane.shape
-    r, c = jnp.clip(row + 1, 0, h - 1), jnp.clip(col + 1, 0, w - 1)
-    r0, c0 = jnp.minimum(jnp.floor(r), h - 2), jnp.minimum(jnp.floor(c), w - 2)
-    fr, fc = r - r0, c - c0
-    index = r0.astype(jnp.int32) * w + c0.astype(jnp.int32)
-    flat = plane.ravel()
-    a, b, d, e = (flat.at[index + step].get(mode="promise_in_bounds") for step in (0, 1, w, w + 1))
-    top, bottom = a + fc * (b - a), d + fc * (e - d)
-    return top + fr * (bottom - top)
 
 
 # ------------------------------------------------------------------------------------------- the profile
@@ -259,7 +118,7 @@ def _barrier(gamma):
 def _along(plane, row, col, theta_x, theta_y, t):
     """Reads at x + t theta(x), [len(t), ...]; t: [S] or [S, ...], px."""
     t = t.reshape(t.shape + (1,) * (row.ndim + 1 - t.ndim))
-    return _read(plane, row[None] - t * theta_y[None], col[None] + t * theta_x[None])
+    return read(plane, row[None] - t * theta_y[None], col[None] + t * theta_x[None])
 
 
 def _reach(singular, row, col, theta_x, theta_y, radius: float):

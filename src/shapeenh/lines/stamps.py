@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from shapeenh.lines.profile import _read
+from shapeenh.lines.candidates import read
 from shapeenh.numerics import safe_divide, safe_hypot, safe_sqrt, smoothstep
 
 FOOTPRINTS = ("disc", "ellipse")
@@ -86,7 +86,7 @@ def _at_skeleton(shading, distance, theta_x, theta_y):
     col = lax.broadcasted_iota(jnp.int32, (h, w), 1).astype(distance.dtype)
     row, col = row - distance * theta_y, col + distance * theta_x
     padded = jnp.pad(jnp.where(jnp.isfinite(shading), shading, 0), ((1, 1), (1, 1), (0, 0)), mode="edge")
-    return jnp.stack([_read(padded[..., i], row, col) for i in range(3)])
+    return jnp.stack([read(padded[..., i], row, col) for i in range(3)])
 
 
 # ------------------------------------------------------------------------------------------- footprints f
@@ -133,5 +133,5 @@ def _sample(image, u, v):
     row, col = 0.5 * (1 - v) * h - 0.5, 0.5 * (1 + u) * w - 0.5
     alpha = image[..., 3]
     planes = [jnp.pad(p, 1, mode="edge") for p in (*(image[..., i] * alpha for i in range(3)), alpha)]
-    red, green, blue, a = (_read(p, row, col) for p in planes)
+    red, green, blue, a = (read(p, row, col) for p in planes)
     return jnp.stack([*(safe_divide(c, a) for c in (red, green, blue)), a], axis=-1)
