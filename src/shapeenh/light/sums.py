@@ -127,13 +127,17 @@ def _forms(model: kernel.Model, planes, light):
 def _weights(model: kernel.Model, on, planes, rows):
     """(What the weights and their derivatives have in common, the weights), each (block, light, 64) and stored.
 
-    What they have in common apart: a root and a logarithm once instead of in every kernel that needs them, and kernels
-    that keep fewer values alive, take a tenth less time.
+    What they have in common apart: a root, a cosine and a logarithm once instead of in every kernel that needs them,
+    and kernels that keep fewer values alive, take a fifth less time.
     """
 
     def root(planes, rows):
         light, _ = _unpack(rows)
         return kernel.root(_forms(model, planes, light), light)
+
+    def cosine(planes, rows, known):
+        light, _ = _unpack(rows)
+        return kernel.warped_cosine(_forms(model, planes, light) | known, light)
 
     def log(planes, rows, known):
         light, _ = _unpack(rows)
@@ -143,7 +147,10 @@ def _weights(model: kernel.Model, on, planes, rows):
         light, _ = _unpack(rows)
         return kernel.weights(model, _forms(model, planes, light) | known, light)
 
-    known = {"root": stored(on, root, planes, rows)} if model.warped else {}
+    known: dict = {}
+    if model.warped:
+        known = {"root": stored(on, root, planes, rows)}
+        known = known | {"cos_light": stored(on, cosine, planes, rows, known)}
     if model.glossy:
         known = known | {"log": stored(on, log, planes, rows, known)}
     return known, stored(on, weigh, planes, rows, known)

@@ -175,6 +175,13 @@ def root(form: dict, light: dict):
     return lax.rsqrt(light["w"] * light["w"] + form["stretch"])
 
 
+def warped_cosine(form: dict, light: dict):
+    """n.l of warped models."""
+    w = light["w"]
+    cos_light = form["root"] ** 2 * (2 * w * form["tilt"] + form["cos_view"] * (w * w - form["stretch"]))
+    return jnp.where((cos_light > 0) & (form["facing"] > 0), cos_light, 0)
+
+
 def meet(model: Model, form: dict, light: dict) -> Meeting:
     """The geometry of `weights`."""
     cos_view, w, v = form["cos_view"], light["w"], light["v"]
@@ -182,8 +189,7 @@ def meet(model: Model, form: dict, light: dict) -> Meeting:
     if model.warped:
         t = form["root"]
         square = t * t
-        cos_light = square * (2 * w * form["tilt"] + cos_view * (w * w - form["stretch"]))
-        cos_light = jnp.where((cos_light > 0) & (form["facing"] > 0), cos_light, 0)
+        cos_light = form["cos_light"]
         half_view, inverse = w * t, (0.5 * v * v) * ((w * w + form["stretch"]) * t)
         q = 2 * w * square
         j = q * q
