@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import shapeenh as se
+from shapeenh.descriptor.diffusion import levels_for
 from tests.absences import ABSENCES, NOT_NUMERIC
 from tests.claims import CLAIMS
 from tests.scenes import SCENES, SIZE, make_scene
@@ -165,6 +166,24 @@ def test_lights_of_a_map_move_with_their_cells_fixed_and_jump_where_cells_change
     assert abs(lights(high) - lights(low)) > 1e-2  # over a step of 1e-11
     assert abs(slope(low)) < 1e3
     assert abs(slope(high)) < 1e3
+
+
+@pytest.mark.slow
+def test_fast_diffusion_steps_where_a_coarser_grid_joins(x64):
+    """`describe`: its value jumps at such a sigma, by no more than the scheme's error; explicit steps do not."""
+    low, high = 2.0, 4.0
+    first = levels_for(low)
+    while high - low > 1e-12:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if levels_for(middle) == first else (low, middle)
+
+    gbuffer = scenes()["torus"].gbuffer
+    smoothed = lambda *how: np.asarray(se.describe(gbuffer, sigma=how[0], scheme=how[1]).gradient)  # noqa: E731
+    below, above, exact = smoothed(low, "fast"), smoothed(high, "fast"), smoothed(high, "explicit")
+    size = lambda a: np.sqrt(np.sum(a * a) / np.sum(exact * exact))  # noqa: E731
+    assert size(above - below) > 1e-6
+    assert size(above - below) <= 1.01 * (size(above - exact) + size(below - exact))
+    assert size(smoothed(low, "explicit") - exact) < 1e-9
 
 
 def test_the_fitted_parameter_moves_with_target_and_arguments(x64):
