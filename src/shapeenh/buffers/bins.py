@@ -2,9 +2,8 @@
 
 Every face gets a class: 0 = nothing to draw (culled, off the image, without area, or between pixel centres), k = its
 pixel centres fit the window WINDOWS[k - 1], MEDIUM = larger, LARGE = too long for 32 bits, or cut by the near plane.
-The faces of a class are then *found*, in ascending order and as they are needed: bit words, prefix counts of their
-population, and a bisection for the n-th bit. That is several times faster than a sort or a compaction, has no
-capacity, and cannot overflow.
+Faces of a class are then *listed*, in ascending order, by bit words and counts of their bits: several times faster
+than a sort, without a capacity that could overflow.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import numpy as np
 from jax import lax
 
 from shapeenh.buffers.project import BEHIND, double_area, faces_viewer, pixel_box, three
-from shapeenh.buffers.xla import lower_bound, take
+from shapeenh.buffers.xla import take
 from shapeenh.fusion import stored
 
 WINDOWS = ((2, 2), (4, 4), (8, 8))  # rows, columns
@@ -113,24 +112,35 @@ def block_start(block, count):
     return jnp.minimum(block * size, count - size) if blocks > 1 else block * 0
 
 
-def select(words, ends, row, rank, count):
-    """Index of the face that is number `rank` [n] of the class in this row, of `count` faces in all: its word by
-    bisection over the counts, its bit by bisection over population counts. words and ends are flat."""
-    n = words.shape[0] // LARGE
-    at = lower_bound(ends, row * n, n, rank)
-    word = take(words, row * n + at)
-    k = rank - (take(ends, row * n + at) - lax.population_count(word).astype(jnp.int32))
-    bit = jnp.zeros(rank.shape, jnp.int32)
-    for half in (16, 8, 4, 2, 1):
-        low = word & jnp.uint32((1 << half) - 1)
-        below = lax.population_count(low).astype(jnp.int32)
-        up = k >= below
-        k = jnp.where(up, k - below, k)
-        bit = jnp.where(up, bit + half, bit)
-        word = jnp.where(up, word >> half, low)
-    block = block_size(count)[0] // 32
-    within = at % block
-    return block_start(at // block, count) + (within // LANES) * (32 * LANES) + bit * LANES + within % LANES
+def list_faces(always, words, ends, count, room):
+    """The faces of all classes but 0, [count + room]: class after class, ascending in each; and where each begins.
+
+    Block by block: a face's place is the number of faces of its class up to it, its bits counted in the word.
+    """
+    size, blocks = block_size(count)
+    totals = ends[:, -1]
+    begins = jnp.cumsum(totals, dtype=jnp.int32) - totals
+    bit = np.arange(32, dtype=np.uint32)[None, :, None]
+    before = (np.uint32(1) << bit) - np.uint32(1)
+
+    def step(i, faces):
+        def places(words, ends):
+            of_block = [
+                lax.dynamic_slice(t, (jnp.int32(0), i * (size // 32)), (LARGE, size // 32)) for t in (words, ends)
+            ]
+            words, ends = (t.reshape(LARGE, -1, 1, LANES) for t in of_block)
+            place = jnp.full((size // (32 * LANES), 32, LANES), count + room - 1, jnp.int32)
+            for k in range(LARGE):
+                later = lax.population_count(words[k] & ~before).astype(jnp.int32)  # this face and those after it
+                place = jnp.where((words[k] >> bit) & 1 > 0, begins[k] + ends[k] - later, place)
+            return place.reshape(-1)
+
+        place = stored(always, places, words, ends)
+        face = block_start(i, count) + lax.iota(jnp.int32, size)
+        return faces.at[place].set(face, mode="promise_in_bounds", wrap_negative_indices=False)
+
+    faces = lax.fori_loop(jnp.int32(0), jnp.int32(blocks), step, jnp.zeros((count + room,), jnp.int32))
+    return faces, begins
 
 
 def corner_indices(faces, face):

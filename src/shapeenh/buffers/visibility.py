@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 
 from shapeenh import checks
-from shapeenh.buffers.bins import LARGE, WINDOWS, ascending, bin_faces, corner_indices, select
+from shapeenh.buffers.bins import LARGE, WINDOWS, ascending, bin_faces, corner_indices, list_faces
 from shapeenh.buffers.inputs import check_camera, check_mesh
 from shapeenh.buffers.project import SUB, clip_matrix, nearness, nearness_shift, project
 from shapeenh.buffers.tiles import FACES, PAIRS, TILE, draw_tiles, tile_count
@@ -34,7 +34,7 @@ from shapeenh.buffers.xla import lower_bound, take
 from shapeenh.fusion import stored, unknown_truth
 from shapeenh.types import Camera, Mesh, Visibility
 
-CHUNK = 4096  # faces per step
+CHUNK = 8192  # faces per step
 SLOTS = 65536  # candidate pixels per step
 BORDER = max(TILE, *(k for window in WINDOWS for k in window))  # windows may hang over the right and lower edge
 CULL = {False: "none", None: "none", "none": "none", True: "back", "back": "back", "front": "front"}
@@ -105,29 +105,27 @@ def draw(vertices, faces, m, near, height, width, cull, cells, side):
         shift = nearness_shift(corners)
         words, ends = bin_faces(always, faces, corners, height, width, cull, cells, side)
         totals = ends[:, -1]
-        flat_words, flat_ends, flat_corners, flat_faces = (t.reshape(-1) for t in (words, ends, corners, faces))
+        flat_corners, flat_faces = corners.reshape(-1), faces.reshape(-1)
 
         stride = width + BORDER
         chunk = min(CHUNK, -(-count // 256) * 256)
+        listed, begins = list_faces(always, words, ends, count, chunk)
         steps = jnp.cumsum((totals + (chunk - 1)) // chunk, dtype=jnp.int32)  # of all classes up to this one
 
         def step(state):
-            """The next chunk of faces of one class: found, fetched, drawn."""
+            """The next chunk of faces of one class: fetched, drawn."""
             i, keys = state
             row = jnp.sum(i >= steps, dtype=jnp.int32)
             first_rank = (i - jnp.where(row > 0, steps[row - 1], 0)) * chunk
             rank = first_rank + lax.iota(jnp.int32, chunk)
             total = totals[row]
 
-            def find(rank):
-                return select(flat_words, flat_ends, row, jnp.minimum(rank, total - 1), count)
-
             def fetch(face):
                 index, even = ascending(corner_indices(flat_faces, face))
                 plane = np.arange(3, dtype=np.int32)[:, None, None] * vertices.shape[0]
                 return take(flat_corners, index[None] + plane), index, even
 
-            face = stored(always, find, rank)
+            face = lax.dynamic_slice_in_dim(listed, begins[row] + first_rank, chunk)
             xyr, index, even = stored(always, fetch, face)
             there = jnp.minimum(total - first_rank, chunk)
             # one loop per class, of which all but one take no step: unlike a conditional, a loop updates in place
@@ -187,29 +185,32 @@ def draw_windows(always, keys, face, xyr, valid, shift, sizes, height, width):
 def draw_medium(always, keys, planes, low, box, size, stride):
     """The first `size` of the faces, window by window of WINDOW x WINDOW pixels: as many as their boxes need."""
     n = planes.shape[1]
-    windows = jnp.where(lax.iota(jnp.int32, n) < size, box[1] * box[2], 0)
-    ends = jnp.cumsum(windows, dtype=jnp.int32)
+
+    def listed(box):
+        windows = jnp.where(lax.iota(jnp.int32, n) < size, box[1] * box[2], 0)
+        return windows, jnp.cumsum(windows, dtype=jnp.int32)
+
+    windows, ends = stored(size > 0, listed, box)  # of chunks of other classes, nothing
     total = ends[-1]
-    rows = planes.T
+    flat, row_start = planes.reshape(-1), np.arange(planes.shape[0], dtype=np.int32)[:, None] * n
 
     def step(j, keys):
-        def shifted(rows, low, ends, windows, box):
+        def find(ends, windows, box):
             pair = j * PAIRS + lax.iota(jnp.int32, PAIRS)
-            there = pair < total
-            at = lower_bound(ends, 0, n, jnp.minimum(pair, total - 1))
-            start, columns = take(box[0], at), take(box[1], at)
-            number = jnp.minimum(pair, total - 1) - (take(ends, at) - take(windows, at))
-            row = number // columns
-            return there, take(rows, at), take(low, at), start, number - row * columns, row
+            last = jnp.minimum(pair, total - 1)
+            at = lower_bound(ends, 0, n, last)
+            number = last - (take(ends, at) - take(windows, at))
+            row = number // take(box[1], at)
+            return at, number - row * take(box[1], at), row, pair < total
 
-        there, local, name, start, column, row = stored(always, shifted, rows, low, ends, windows, box)
+        at, column, row, there = stored(always, find, ends, windows, box)
+        local = stored(always, lambda at, flat: take(flat, at[None] + row_start), at, flat)
 
-        def moved(there, local, column, row):
-            return move_window(local.T, column * WINDOW, row * WINDOW, there)
+        def moved(local, column, row, there):
+            return move_window(local, column * WINDOW, row * WINDOW, there)
 
-        edges, plane = stored(always, moved, there, local, column, row)
-        return merge(
-            keys, window_keys(edges, plane, name, WINDOW, WINDOW), start + (row * stride + column) * WINDOW, stride
-        )
+        edges, plane = stored(always, moved, local, column, row, there)
+        start = take(box[0], at) + (row * stride + column) * WINDOW
+        return merge(keys, window_keys(edges, plane, take(low, at), WINDOW, WINDOW), start, stride)
 
     return lax.fori_loop(jnp.int32(0), (total + (PAIRS - 1)) // PAIRS, step, keys)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import lax
 
+HALVINGS = 3
+
 
 def take(array, index):
     """array[index] along the first axis, the indices known to be in range and not negative."""
@@ -18,10 +20,13 @@ def lower_bound(ends, first, count, rank):
 
     def halve(_, state):
         low, step = state
-        middle = low + (step - 1)
-        go = (middle < count) & (take(ends, first + jnp.minimum(middle, count - 1)) <= rank)
-        return jnp.where(go, low + step, low), step >> 1
+        for k in range(HALVINGS):  # several a turn: a turn has its cost
+            half = step >> k
+            middle = low + (half - 1)
+            go = (half > 0) & (middle < count) & (take(ends, first + jnp.minimum(middle, count - 1)) <= rank)
+            low = jnp.where(go, low + half, low)
+        return low, step >> HALVINGS
 
     state = jnp.zeros(rank.shape, jnp.int32), jnp.int32(top)
-    low = lax.fori_loop(jnp.int32(0), jnp.int32(top.bit_length()), halve, state)[0]
+    low = lax.fori_loop(jnp.int32(0), jnp.int32(-(-top.bit_length() // HALVINGS)), halve, state)[0]
     return jnp.minimum(low, count - 1)
