@@ -189,6 +189,7 @@ EYES = {
     "plain": ([0, 0, 3], [0, 0, 0], [0, 1, 0]),
     "up along the view": ([0, 0, 3], [0, 0, 0], [0, 0, 1]),
     "no up": ([0, 0, 3], [0, 0, 0], [0, 0, 0]),
+    "target at the eye": ([0, 0, 3], [0, 0, 3], [0, 1, 0]),
     "far": ([0, 1e12, 3e12], [0, 0, 0], [0, 1e12, 0]),
     "near": ([0, 0, 1e-12], [0, 0, 0], [0, 1e-12, 0]),
 }
@@ -209,7 +210,7 @@ def test_cameras_that_cannot_look_are_finite_when_traced_and_refused_when_not():
             named = dict(zip(("eye", "target", "up"), (np.float32(a) for a in where), strict=True))
             given = named | {"fov": np.float32(fov), "height": np.float32(height), "aspect": np.float32(1.3)}
             check(given, about=f"{kind} {fov}")
-        if kind in ("up along the view", "no up"):
+        if kind in ("up along the view", "no up", "target at the eye"):
             with pytest.raises(ValueError, match="accepted"):
                 cameras(given)
 

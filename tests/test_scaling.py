@@ -114,6 +114,13 @@ def test_curvature_equals_the_twin(dtype, rng):
 # ------------------------------------------------------------------------------------------- the scaled sum
 
 
+def test_no_gradient_of_the_curvature_overflows_where_it_is_zero():
+    """Large curvature, large cotangent, and a direction that sees none of either: 0, not inf times 0."""
+    bent, along = jnp.asarray([1e30, 0, -1e30]), jnp.asarray([0.0, 0, 1])
+    _, pull = jax.vjp(lambda h, l: se.curvature_mapping(h, l, 1.0), bent, along)
+    assert not np.any(pull(jnp.float32(1e20))[1])
+
+
 @pytest.mark.parametrize(("anisotropy", "alpha"), [(0.0, 0.0), (-0.7, 0.0), (0.0, 2.0), (0.7, 2.0)])
 def test_scaled_radiance_equals_the_twin(dtype, rng, anisotropy, alpha):
     gbuffer, descriptor, lights, material = make_scene(rng, dtype, spread=1.0)

@@ -26,7 +26,8 @@ def curvature_mapping(hessian, direction, anisotropy):
     h, l = (jnp.broadcast_to(jnp.asarray(a, dtype), (*shape, 3)) for a in (hessian, direction))
     x, y = l[..., 0], l[..., 1]
     mean, half = 0.5 * h[..., 0] + 0.5 * h[..., 2], 0.5 * h[..., 0] - 0.5 * h[..., 2]
-    bend = half * (x * x - y * y) + 2 * h[..., 1] * x * y
+    # as x H x, so that no derivative multiplies two large numbers before a small one
+    bend = x * (half * x + h[..., 1] * y) + y * (h[..., 1] * x - half * y)
     return jnp.tanh(mean + jnp.broadcast_to(jnp.asarray(anisotropy, dtype), shape) * bend)
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shapeenh.checks import check_finite, check_range, check_shape, check_type, float_dtype, is_concrete
-from shapeenh.numerics import normalize
+from shapeenh.numerics import norm, normalize
 from shapeenh.types import Camera, Mesh
 
 NEAR_FRACTION = 1e-3  # near plane as a fraction of the distance from eye to target
@@ -154,7 +154,7 @@ def look_at(eye, target, up) -> tuple[jax.Array, jax.Array]:
         raise ValueError(f"eye and target are both {np.asarray(eye).tolist()}; accepted are two different points")
     rotation = _axes(backwards, up, "eye - target")
     view = jnp.zeros((4, 4), dtype).at[:3, :3].set(rotation).at[:3, 3].set(-rotation @ eye).at[3, 3].set(1)
-    return view, jnp.sqrt(jnp.sum(backwards * backwards))
+    return view, norm(backwards)
 
 
 def _axes(backwards, up, name: str):
