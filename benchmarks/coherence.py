@@ -216,7 +216,11 @@ def main() -> None:
     far = agglomeration(mesh, noisy, arguments.height)
     print(harness.table(far))
     facts = {"mesh": Path(path).stem if path else "knot", "frames": arguments.frames}
-    print(harness.write("coherence", rows, **facts, per_frame=results, distances=far))
+    least = [min((r for r in rows if r["motion"] == motion), key=lambda r: r["change"]) for motion in results]
+    said = "Least ink changes from frame to frame: " + "; ".join(
+        f"{r['motion']}, {r['method']} ({100 * r['change']:.0f} %)" for r in least
+    )
+    print(harness.write("coherence", rows, **facts, per_frame=results, distances=far, answer=said + "."))
     plot(results, harness.RESULTS / "coherence.png")
 
 

@@ -238,6 +238,18 @@ def ratios(rows: list[dict]) -> list[dict]:
     return [{k: line.get(k) for k in names} for line in out.values()]
 
 
+def conclude(lines: list[dict]) -> str:
+    """In how many scenes the G-buffer is ahead of each peer's."""
+    scenes = [line for line in lines if line["call"] == "G-buffer"]
+    said = [f"The G-buffer takes {min(t)} to {max(t)} ms" for t in [[line["ours_ms"] for line in scenes]] if t]
+    for name in dict.fromkeys(k for line in scenes for k in line if k.endswith("/ ours")):
+        found = [line[name] for line in scenes if line[name] is not None]
+        if found:
+            ahead = f"ahead in {sum(r > 1 for r in found)} of {len(found)} scenes"
+            said.append(f"{name.removesuffix(' / ours')} {min(found)} to {max(found)} times as long, ours {ahead}")
+    return "; ".join(said) + "." if said else ""
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("mesh", nargs="*")
@@ -271,7 +283,9 @@ def main() -> None:
         print(f"not here: {name} ({why})")
     print(found["memory"])
     print(plot(found["rows"]))
-    print(write("raster", found["rows"], memory=found["memory"], missing=found["missing"]))
+    said = conclude(ratios(found["rows"]))
+    print(write("raster", found["rows"], memory=found["memory"], missing=found["missing"], answer=said))
+    print(said)
 
 
 if __name__ == "__main__":
