@@ -52,7 +52,7 @@ def rasterize(mesh: Mesh, camera: Camera, *, height: int, width: int, cull: bool
     *Static*: height, width: pixels, 1 to 32768. cull: False or "none" draws both sides; True or "back" drops faces
     seen from behind (clockwise); "front" drops the others.
     Returns triangle [height, width] int32, -1 for background. Beside that and the mesh, memory for about 8 bytes per
-    pixel and 7 per face is taken for the while.
+    pixel and 11 per face is taken for the while.
     *Gradient*: none; `interpolate` has the gradients of what is seen.
     *Errors*: ValueError for NaN or infinite vertices (how many), a face index out of range, a wrong shape or option.
     Under jit, where values cannot be looked at, faces with such vertices are not drawn. Recompiles for a new V, F,
