@@ -12,7 +12,6 @@ of the ink is specks, and how much of the clean mesh's ink is found where it was
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -198,8 +197,8 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=12)
     parser.add_argument("--height", type=int, default=400)
     arguments = parser.parse_args()
-    path = arguments.mesh or harness.data("armadillo.obj")
-    mesh = se.load_mesh(path) if path else se.carved_knot()
+    paths = [arguments.mesh] if arguments.mesh else []
+    name, mesh = next(iter(harness.meshes(paths, ("armadillo",)).items()))
     noisy = roughened(mesh)
     results = {
         motion + suffix: popping(m, motion, arguments.frames, arguments.height)
@@ -208,14 +207,14 @@ def main() -> None:
     }
     rows = []
     for motion, methods in results.items():
-        for name, frames in methods.items():
+        for method, frames in methods.items():
             found = {key: [f[key] for f in frames] for key in ("change", "pops", "ink", "known")}
             mean = {key: float(np.mean(numbers)) for key, numbers in found.items()}
-            rows.append({"motion": motion, "method": name, **mean, "worst change": max(found["change"])})
+            rows.append({"motion": motion, "method": method, **mean, "worst change": max(found["change"])})
     print(harness.table(rows))
     far = agglomeration(mesh, noisy, arguments.height)
     print(harness.table(far))
-    facts = {"mesh": Path(path).stem if path else "knot", "frames": arguments.frames}
+    facts = {"mesh": name, "frames": arguments.frames}
     least = [min((r for r in rows if r["motion"] == motion), key=lambda r: r["change"]) for motion in results]
     said = "Least ink changes from frame to frame: " + "; ".join(
         f"{r['motion']}, {r['method']} ({100 * r['change']:.0f} %)" for r in least

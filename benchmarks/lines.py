@@ -114,10 +114,7 @@ def main() -> None:
     parser.add_argument("--kind", default="valley")
     arguments = parser.parse_args()
     width, height = (int(n) for n in arguments.size.split("x"))
-    meshes = {p.stem: se.load_mesh(p) for p in arguments.meshes}
-    if not meshes:
-        path = harness.data("armadillo.obj")
-        meshes = {"armadillo": se.load_mesh(path)} if path else {"knot": se.carved_knot()}
+    meshes = harness.meshes(arguments.meshes, ("armadillo",))
     rows = []
     for name, mesh in meshes.items():
         calls, facts = stages(mesh, arguments.kind, width=width, height=height)

@@ -4,6 +4,7 @@ one shape, so that nothing compiles again from example to example."""
 from dataclasses import dataclass
 
 import hypothesis.strategies as st
+import jax.numpy as jnp
 import numpy as np
 
 import shapeenh as se
@@ -43,6 +44,10 @@ draws = st.builds(
     gamma=st.sampled_from((0.0, 1e-30, 0.3, 1.0, 40.0, 1e6, 1e20)),
     light=st.sampled_from(LIGHTS),
 )
+
+
+def is_float(leaf):
+    return jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
 def unit(v):

@@ -277,10 +277,6 @@ def parameters(draw, dtype):
     return jax.tree.map(lambda a: np.asarray(a, dtype), made) | {"camera": camera(dtype)}
 
 
-def is_float(leaf):
-    return jnp.issubdtype(leaf.dtype, jnp.floating)
-
-
 @functools.cache
 def program(function, gradient: bool):
     """jit of ((value, outputs), gradients in every image and parameter), or of outputs alone."""
@@ -288,7 +284,7 @@ def program(function, gradient: bool):
     def value(floats, mask, p):
         out = function(floats | {"mask": mask}, p)
         rng = np.random.default_rng(zlib.crc32(function.__name__.encode()))
-        leaves = [leaf for leaf in jax.tree.leaves(out) if is_float(leaf)]
+        leaves = [leaf for leaf in jax.tree.leaves(out) if hostile.is_float(leaf)]
         return sum(jnp.sum(rng.uniform(0.1, 1, leaf.shape).astype(leaf.dtype) * leaf) for leaf in leaves), out
 
     if gradient:
@@ -316,7 +312,7 @@ def overflows(function, i, p):
 
     def wide(leaf):
         leaf = np.asarray(leaf)
-        return leaf.astype(np.float64) if is_float(leaf) else leaf
+        return leaf.astype(np.float64) if hostile.is_float(leaf) else leaf
 
     floats = {name: wide(image) for name, image in i.items() if name != "mask"}
     with jax.enable_x64(True):
@@ -328,7 +324,7 @@ def check_outputs(out, shape, dtype):
     for leaf in jax.tree.leaves(out):
         assert leaf.shape[:2] in (shape, ())
         assert leaf.dtype in (dtype, bool)
-        if is_float(leaf):
+        if hostile.is_float(leaf):
             assert np.all(np.isfinite(leaf))
 
 

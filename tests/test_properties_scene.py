@@ -17,15 +17,11 @@ from tests.absences import NOT_NUMERIC
 SHAPE = 9, 11
 
 
-def is_float(leaf):
-    return jnp.issubdtype(leaf.dtype, jnp.floating)
-
-
 def checked(function):
     """(arguments, *held) -> None: jit of value and gradient, of which everything must be finite."""
 
     def value(floats, *held):
-        out = [leaf for leaf in jax.tree.leaves(function(floats, *held)) if is_float(leaf)]
+        out = [leaf for leaf in jax.tree.leaves(function(floats, *held)) if hostile.is_float(leaf)]
         return sum(jnp.sum(leaf) for leaf in out), out
 
     both = jax.jit(jax.value_and_grad(value, argnums=0, has_aux=True))

@@ -36,7 +36,7 @@ from shapeenh.types import Camera, Mesh, Visibility
 
 CHUNK = 8192  # faces per step
 SLOTS = 65536  # candidate pixels per step
-BORDER = max(TILE, *(k for window in WINDOWS for k in window))  # windows may hang over the right and lower edge
+BORDER = max(TILE, WINDOW, *(k for window in WINDOWS for k in window))  # windows may hang over the right and lower edge
 CULL = {False: "none", None: "none", "none": "none", True: "back", "back": "back", "front": "front"}
 
 
@@ -198,7 +198,7 @@ def draw_medium(always, keys, planes, low, box, size, stride):
         def find(ends, windows, box):
             pair = j * PAIRS + lax.iota(jnp.int32, PAIRS)
             last = jnp.minimum(pair, total - 1)
-            at = lower_bound(ends, 0, n, last)
+            at = lower_bound(ends, last)
             number = last - (take(ends, at) - take(windows, at))
             row = number // take(box[1], at)
             return at, number - row * take(box[1], at), row, pair < total

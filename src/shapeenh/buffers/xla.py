@@ -13,9 +13,10 @@ def take(array, index):
     return array.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
-def lower_bound(ends, first, count, rank):
+def lower_bound(ends, rank):
     """The first i < count with ends[first + i] > rank, for an ascending stretch of `ends`; a branchless bisection,
     all ranks at once."""
+    count = ends.shape[0]
     top = 1 << max(count - 1, 0).bit_length()
 
     def halve(_, state):
@@ -23,7 +24,7 @@ def lower_bound(ends, first, count, rank):
         for k in range(HALVINGS):  # several a turn: a turn has its cost
             half = step >> k
             middle = low + (half - 1)
-            go = (half > 0) & (middle < count) & (take(ends, first + jnp.minimum(middle, count - 1)) <= rank)
+            go = (half > 0) & (middle < count) & (take(ends, jnp.minimum(middle, count - 1)) <= rank)
             low = jnp.where(go, low + half, low)
         return low, step >> HALVINGS
 

@@ -52,7 +52,6 @@ class Search:
         residual = float(value) / self.target - 1
         self.points.append((residual, np.array(u, np.float64)))
         if abs(residual) <= self.tolerance:
-            self.reason = ""
             raise Stop
         if len(self.points) >= self.budget:
             self.reason = f"max_renders = {self.budget} pictures did not do"
