@@ -44,11 +44,17 @@ def _quarters(array):
     return tuple(array[..., i::2, j::2] for i in (0, 1) for j in (0, 1))
 
 
-def _assemble(parts):
-    """Inverse of `_quarters`."""
-    a, b, c, d = parts
-    rows = jnp.stack([jnp.stack([a, b], -1), jnp.stack([c, d], -1)], -3)
-    return rows.reshape(*a.shape[:-2], 2 * a.shape[-2], 2 * a.shape[-1])
+def _blocks(cells):
+    """Every pixel of a 2 x 2 block gets the block's value."""
+    *lead, h, w = cells.shape
+    rows = jnp.broadcast_to(cells[..., None], (*lead, h, w, 2)).reshape(*lead, h, 1, 2 * w)
+    return jnp.broadcast_to(rows, (*lead, h, 2, 2 * w)).reshape(*lead, 2 * h, 2 * w)
+
+
+def _over_blocks(planes):
+    """Sums over the blocks."""
+    rows = planes[..., 0::2, :] + planes[..., 1::2, :]
+    return rows[..., 0::2] + rows[..., 1::2]
 
 
 def _even(array, size):
@@ -58,9 +64,8 @@ def _even(array, size):
     )
 
 
-def _roles(volume, border_x, border_y, *, spacing):
-    """The role of every pixel, int8; 0 for none. All sizes even."""
-    strong_x, strong_y = border_x >= _STRONG * spacing, border_y >= _STRONG * spacing
+def _members(volume, strong_x, strong_y):
+    """Which members of a block form its cell: a bit for each quarter, `[h, w]` int8."""
     v = _quarters(volume)
     top, _, bottom, _ = _quarters(strong_x)
     left, right, _, _ = _quarters(strong_y)
@@ -79,45 +84,77 @@ def _roles(volume, border_x, border_y, *, spacing):
             c | a & left | d & bottom,
             d | b & right | c & bottom,
         )
-    cell = _assemble([part.astype(jnp.int8) for part in (a, b, c, d)])
+    return sum(part.astype(jnp.int8) << i for i, part in enumerate((a, b, c, d)))
 
-    # of the others, those linked to the cell of a neighbouring block
+
+def _in_cell(members):
+    """1 for the pixels of a cell, else 0, from the bits of `_members`."""
+    bits = _blocks(members)
+    row, column = (lax.broadcasted_iota(jnp.int32, bits.shape, axis) % 2 for axis in (0, 1))
+    return (bits >> (2 * row + column).astype(jnp.int8)) & 1
+
+
+def _join(cell, alive, strong_x, strong_y):
+    """The roles: `cell`'s, and of the others those linked to the cell of a neighbouring block."""
     role = cell
     for name, step, axis in _SIDES:
-        odd = lax.broadcasted_iota(jnp.int32, volume.shape, axis % 2) % 2
+        odd = lax.broadcasted_iota(jnp.int32, role.shape, axis % 2) % 2
         strong = strong_x if axis == -1 else strong_y
         link = strong if step == 1 else shift(strong, -1, axis)
-        joins = (role == 0) & (volume > 0) & (odd == (step == 1)) & link & (shift(cell, step, axis) == _CELL)
+        joins = (role == 0) & alive & (odd == (step == 1)) & link & (shift(cell, step, axis) == _CELL)
         role = jnp.where(joins, jnp.int8(name), role)
     return role
 
 
-def _gather(planes, role):
-    """Sums over the cells, `[..., h, w]`, of `[..., 2h, 2w]` planes."""
+def _roles(volume, border_x, border_y, always, *, spacing):
+    """The role of every pixel, int8; 0 for none. All sizes even."""
+    least = _STRONG * spacing
+
+    def members(volume, border_x, border_y):
+        return _members(volume, border_x >= least, border_y >= least)
+
+    def join(cell, volume, border_x, border_y):
+        return _join(cell, volume > 0, border_x >= least, border_y >= least)
+
+    cell = stored(always, _in_cell, stored(always, members, volume, border_x, border_y))
+    return stored(always, join, cell, volume, border_x, border_y)
+
+
+def _hand_over(planes, role):
+    """Members that join the cell of a neighbouring block hand their value to its nearest pixel; others keep it."""
     role = role.reshape((1,) * (planes.ndim - 2) + role.shape)
     total = jnp.where(role == _CELL, planes, 0)
     for name, step, axis in _SIDES:
         total = total + shift(jnp.where(role == name, planes, 0), -step, axis)
-    a, b, c, d = _quarters(total)
-    return a + b + c + d
+    return total
 
 
-def _spread(cells, planes, role):
-    """Every pixel its cell's value; those without one keep that of `planes`."""
-    *lead, h, w = cells.shape
-    blocks = jnp.broadcast_to(cells[..., :, None, :, None], (*lead, h, 2, w, 2)).reshape(*lead, 2 * h, 2 * w)
+def _choose(blocks, planes, role):
+    """The value of every pixel's cell; those without one keep that of `planes`."""
     out = jnp.where(role[None] == _CELL, blocks, planes)
     for name, step, axis in _SIDES:
         out = jnp.where(role[None] == name, shift(blocks, step, axis), out)
     return out
 
 
-def _merge(volume, border_x, border_y, role):
-    """Volumes and borders of the cells."""
+def _across(border_x, border_y, role):
+    """Borders between two pixels that are both in their blocks' cells, else 0."""
     cell = role == _CELL
-    across_x = jnp.where(cell & shift(cell, 1, -1), border_x, 0)[:, 1::2]
-    across_y = jnp.where(cell & shift(cell, 1, -2), border_y, 0)[1::2]
-    return _gather(volume, role), across_x[0::2] + across_x[1::2], across_y[:, 0::2] + across_y[:, 1::2]
+    across_x = jnp.where(cell & shift(cell, 1, -1), border_x, 0)
+    return across_x, jnp.where(cell & shift(cell, 1, -2), border_y, 0)
+
+
+def _merge(volume, border_x, border_y, role, always):
+    """Volumes and borders of the cells."""
+    across_x, across_y = stored(always, _across, border_x, border_y, role)
+    volume = stored(always, _hand_over, volume, role)
+
+    def add(volume, across_x, across_y):
+        over_x = (across_x[0::2] + across_x[1::2])[:, 1::2]
+        over_y = across_y[1::2]
+        return _over_blocks(volume), over_x, over_y[:, 0::2] + over_y[:, 1::2]
+
+    return stored(always, add, volume, across_x, across_y)
 
 
 def _conduct(border, volume, axis: int, spacing, step):
@@ -153,20 +190,29 @@ def _descend(stacks, level: int, time, cells, always, levels: int, sure: bool):
     def coarse(stacks):
         size = h, w = volume.shape
         v, bx, by = _even(volume, size), _even(border_x, size), _even(border_y, size)
-        role = stored(always, lambda *a: _roles(*a, spacing=spacing), v, bx, by)
-        below = stored(always, _merge, v, bx, by, role)
+        role = _roles(v, bx, by, always, spacing=spacing)
+        below = _merge(v, bx, by, role, always)
 
-        def down(planes, role, v, volume):
-            return _gather(_even(planes, size) * v[None], role) / jnp.where(volume > 0, volume, 1)[None]
+        def hand_over(planes, role, v):
+            return _hand_over(_even(planes, size) * v[None], role)
 
-        def up(cells, planes, role):
-            return _spread(cells, _even(planes, size), role)[:, :h, :w]
+        def average(planes, volume):
+            return _over_blocks(planes) / jnp.where(volume > 0, volume, 1)[None]
+
+        def down(planes):
+            return stored(always, average, stored(always, hand_over, planes, role, v), below[0])
+
+        def choose(blocks, planes, role):
+            return _choose(blocks, _even(planes, size), role)[:, :h, :w]
+
+        def up(cells, planes):
+            return stored(always, choose, stored(always, _blocks, cells), planes, role)
 
         aside = jnp.full((1, 1), smoothing, volume.dtype)
         stacks = smooth(stacks, aside, _SMOOTHING[min(level, 1)])
-        lower = tuple(stored(always, down, planes, role, v, below[0]) for planes in stacks)
+        lower = tuple(down(planes) for planes in stacks)
         lower = _descend(lower, level + 1, rest, below, always, levels, sure)
-        stacks = tuple(stored(always, up, c, planes, role) for c, planes in zip(lower, stacks, strict=True))
+        stacks = tuple(up(cells, planes) for cells, planes in zip(lower, stacks, strict=True))
         return smooth(stacks, aside, _SMOOTHING[min(level, 1)])
 
     if sure:
