@@ -15,9 +15,16 @@ from jax import lax
 
 from shapeenh.fusion import stored, unknown_truth
 from shapeenh.lines.stamps import Stamps, imprint, stamps_planes, tinted
+from shapeenh.lines.tiles import over_tiles
 
 LANES = 64
 GROUP = 128  # runs per step: what they read stays in the cache
+
+
+def rim(width: int, reach: int):
+    """How many pixels `draw_listed` reads around an image of whole runs: ((above, below), (left, right))."""
+    return (reach, reach), (reach, -width % LANES + reach)
+
 
 # ------------------------------------------------------------------------------------------- barriers
 #
@@ -32,18 +39,21 @@ def crossings(barriers):
     return jnp.cumsum(across, axis=1) - across, jnp.cumsum(down, axis=0) - down
 
 
-def crossings_on_host(across: np.ndarray, down: np.ndarray):
-    """`crossings` of concrete barriers, modulo 256, which is as good: no footprint spans that many. The rows outside
-    those that hold barriers cost nothing."""
-    counts = np.zeros((2, *across.shape), np.int8)
+def crossings_on_host(across: np.ndarray, down: np.ndarray, reach: int):
+    """`crossings` of concrete barriers, in the frame of `rim`, modulo 256, which is as good: no footprint spans that
+    many. The rows outside those that hold barriers cost nothing. No stamp lies in the rim, so any count may.
+    """
+    h, w = across.shape
+    counts = [np.zeros([n + sum(sides) for n, sides in zip((h, w), rim(w, reach), strict=True)], np.int8) for _ in "xy"]
+    inner = [count[reach : reach + h, reach : reach + w] for count in counts]
     used = np.flatnonzero(across.any(axis=1) | down.any(axis=1))
     if used.size:
         first, last = int(used[0]), int(used[-1]) + 1
-        np.add.accumulate(across[first:last, :-1].view(np.int8), axis=1, dtype=np.int8, out=counts[0, first:last, 1:])
-        for row in range(first, min(last, down.shape[0] - 1)):  # NumPy's own sum along columns takes four times as long
-            np.add(counts[1, row], down[row].view(np.int8), out=counts[1, row + 1])
-        counts[1, last + 1 :] = counts[1, last : last + 1]
-    return tuple(jnp.asarray(c) for c in counts)
+        np.add.accumulate(across[first:last, :-1].view(np.int8), axis=1, dtype=np.int8, out=inner[0][first:last, 1:])
+        for row in range(first, min(last, h - 1)):  # NumPy's own sum along columns takes four times as long
+            np.add(inner[1][row], down[row].view(np.int8), out=inner[1][row + 1])
+        inner[1][last + 1 :] = inner[1][last : last + 1]
+    return tuple(counts)
 
 
 def _free(stamp, pixel, row_of_stamp, row_of_pixel):
@@ -60,12 +70,16 @@ def _free(stamp, pixel, row_of_stamp, row_of_pixel):
 # ------------------------------------------------------------------------------------------- which runs
 
 
-def list_runs(weight, barriers, reach: int):
+def list_runs(weight, valid, barriers, reach: int):
     """(runs [n] int32, how many of them [2] int32): first those without barriers within reach, then those with.
 
-    barriers: [H, W] bool each, concrete; or None.
+    weight: [H, W]; valid, barriers: [H, W] bool each, concrete, or None; where not valid, there is no weight.
     """
-    near = _near(np.asarray(weight) > 0, reach)
+    stamped, rows = np.zeros(valid.shape, bool), np.flatnonzero(valid.any(axis=1))
+    if rows.size:
+        used = slice(int(rows[0]), int(rows[-1]) + 1)
+        stamped[used] = weight[used] > 0
+    near = _near(stamped, reach)
     if barriers is None:
         cut = np.zeros_like(near)
     else:
@@ -76,7 +90,7 @@ def list_runs(weight, barriers, reach: int):
     for first, runs in ((0, free), (start, held)):
         whole = -(-runs.size // GROUP) * GROUP
         listed[first : first + whole] = np.pad(runs, (0, whole - runs.size), mode="edge") if runs.size else 0
-    return jnp.asarray(listed), jnp.asarray([start // GROUP, -(-held.size // GROUP)], jnp.int32)
+    return listed, np.asarray([start // GROUP, -(-held.size // GROUP)], np.int32)
 
 
 def _near(flags: np.ndarray, reach: int) -> np.ndarray:
@@ -102,19 +116,41 @@ def _near(flags: np.ndarray, reach: int) -> np.ndarray:
 # ------------------------------------------------------------------------------------------- the sum (8.1)
 
 
-@partial(jax.jit, static_argnames=("function", "reach"))
-def draw_listed(stamps: Stamps, listed, counts, brush, noise, image, crossed, *, function, reach):
-    """The picture [H, W, 4], from the listed runs alone. crossed: `crossings`, or None."""
-    h, w = stamps.weight.shape
+@partial(jax.jit, static_argnames=("wants", "margin", "reach"))
+def framed_stamps(images, brush, tiles, *, wants, margin, reach) -> Stamps:
+    """The stamps of (profile, field, shading, noise) in the frame of `rim`, plane by plane, with none there.
+
+    wants: as for `stamps_planes`. tiles: outside of which there are none either, or None.
+    """
+    always, frame = unknown_truth(images[0].distance), rim(images[0].distance.shape[1], reach)
+
+    def planes(images):
+        profile, field, shading, noise = images
+        make = partial(stamps_planes, **dict(wants))
+        weight, radius, *vectors = stored(always, make, profile, field, brush, shading, noise)
+        return Stamps(weight, radius, *(None if v is None else tuple(v) for v in vectors))
+
+    shapes = jax.eval_shape(planes, images)
+    blank = jax.tree.map(lambda _: 0, shapes)._replace(radius=None if shapes.radius is None else 1)
+    blank, structure = jax.tree.flatten(blank)
+    if tiles is None:
+        found = [
+            jnp.pad(p, frame, constant_values=b) for p, b in zip(jax.tree.leaves(planes(images)), blank, strict=True)
+        ]
+    else:
+        found = over_tiles(
+            lambda images: jax.tree.leaves(planes(images)), images, tiles, blank, margin=margin, rim=frame
+        )
+    return jax.tree.unflatten(structure, found)
+
+
+@partial(jax.jit, static_argnames=("function", "reach", "shape"))
+def draw_listed(stamps: Stamps, listed, counts, brush, noise, image, crossed, *, function, reach, shape):
+    """The picture [H, W, 4], from the listed runs alone. stamps, crossed: from `framed_stamps`, `crossings_on_host`."""
+    h, w = shape
     runs = -(-w // LANES)
     stride, side = runs * LANES + 2 * reach, 2 * reach + 1
-    pad = ((reach, reach), (reach, stride - w - reach))
-    flat = lambda plane: jnp.pad(plane, pad).ravel()  # noqa: E731
-    split = lambda planes: None if planes is None else tuple(flat(p) for p in planes)  # noqa: E731
-    radius = None if stamps.radius is None else jnp.pad(stamps.radius, pad, constant_values=1).ravel()
-    planes = Stamps(flat(stamps.weight), radius, split(stamps.color), split(stamps.turn), split(stamps.moved))
-    counted = () if crossed is None else tuple(jnp.pad(c, pad, mode="edge").ravel() for c in crossed)
-    paper = None if noise is None else flat(noise[..., 0])
+    planes, counted = jax.tree.map(jnp.ravel, (stamps, crossed or ()))
 
     one = jax.tree.map(lambda plane: plane[:1], planes)
     own_rgb = jax.eval_shape(lambda p: imprint(p, 0.0, 0.0, brush, image, function), one)[1] is not None
@@ -144,7 +180,10 @@ def draw_listed(stamps: Stamps, listed, counts, brush, noise, image, crossed, *,
             return total
 
         total = lax.fori_loop(0, side, row, [jnp.zeros((GROUP, LANES), stamps.weight.dtype)] * channels)
-        sheet = None if paper is None else _read_runs(paper, centre + reach, LANES)
+        sheet = None
+        if noise is not None:
+            column = jnp.minimum((run % runs * LANES)[:, None] + jnp.arange(LANES, dtype=run.dtype)[None], w - 1)
+            sheet = noise[(run // runs)[:, None], column, 0]
         picture = _compress(total, brush, sheet)
         return canvas.at[run].set(jnp.stack(picture, axis=-1).reshape(GROUP, LANES * 4), mode="promise_in_bounds")
 

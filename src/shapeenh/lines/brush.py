@@ -18,10 +18,11 @@ import numpy as np
 from jax.tree_util import register_dataclass
 
 from shapeenh.checks import check_range, check_shape, check_size, check_type, float_dtype, is_concrete
-from shapeenh.lines.accumulate import crossings_on_host, draw_everywhere, draw_listed, list_runs
+from shapeenh.lines.accumulate import crossings_on_host, draw_everywhere, draw_listed, framed_stamps, list_runs
 from shapeenh.lines.fields import depth_barriers
 from shapeenh.lines.noise import CHANNELS
-from shapeenh.lines.stamps import FOOTPRINTS, stamps_of
+from shapeenh.lines.stamps import FOOTPRINTS
+from shapeenh.lines.tiles import list_tiles, margin_for
 from shapeenh.types import Descriptor, GBuffer, LineField, Profile
 
 LARGEST_REACH = 64
@@ -124,22 +125,29 @@ def draw_lines(
         check_shape("noise", noise, (*shape, CHANNELS))
         noise = jnp.clip(jnp.nan_to_num(jnp.asarray(noise, dtype), nan=0.5), 0, 1)
     _check_brush(brush, shading, noise)
-    barriers = _barriers(gbuffer, descriptor, shape)
+    _check_sheets(gbuffer, descriptor, shape)
     image, function = _footprint(footprint, dtype)
     reach = _reach(brush, reach, function)
-    concrete = is_concrete(profile, field, brush, shading, noise, image, barriers)
+    concrete = is_concrete(profile, field, brush, shading, noise, image, gbuffer, descriptor)
     wants = _wants(brush, shading, noise, function) if concrete else {}
     # one by one, JAX's arrays take as long to make as a small picture takes to draw
     array: Any = np.asarray if is_concrete(brush) else jnp.asarray
     brush = Brush(**{name: array(value, dtype) for name, value in vars(brush).items()})
     options = {"function": function, "reach": reach}
     if not concrete:
+        barriers = None if gbuffer is None else depth_barriers(gbuffer, descriptor)
         return draw_everywhere(profile, field, brush, shading, noise, image, barriers, **options)
-    stamps = stamps_of(profile, field, brush, shading, noise, **wants)
-    barriers = None if barriers is None else tuple(map(np.asarray, barriers))
-    listed, counts = list_runs(stamps.weight, barriers, reach)
-    crossed = None if barriers is None else crossings_on_host(*barriers)
-    return draw_listed(stamps, listed, counts, brush, noise, image, crossed, **options)
+    valid, margin = np.asarray(profile.valid), _margin(profile, wants["colored"] and float(brush.shade) > 0)
+    tiles = list_tiles(valid, margin)
+    images, wants = (profile, field, shading, noise), tuple(wants.items())
+    stamps = framed_stamps(images, brush, tiles, wants=wants, margin=margin, reach=reach)
+    barriers = crossed = None
+    if gbuffer is not None:
+        barriers = tuple(map(np.asarray, depth_barriers(gbuffer, descriptor, near=valid, around=reach + 1)))
+        crossed = crossings_on_host(*barriers, reach)
+    weight = np.asarray(stamps.weight)[reach:, reach:][: shape[0], : shape[1]]
+    listed, counts = list_runs(weight, valid, barriers, reach)
+    return draw_listed(stamps, listed, counts, brush, noise, image, crossed, shape=shape, **options)
 
 
 def _wants(brush, shading, noise, function) -> dict[str, bool]:
@@ -154,15 +162,21 @@ def _wants(brush, shading, noise, function) -> dict[str, bool]:
     }
 
 
-def _barriers(gbuffer, descriptor, shape):
-    """Where footprints end, between a pixel and the next one to the right or below; or None."""
+def _margin(profile, shaded: bool) -> int | None:
+    """How far the stamp of a pixel looks, px: to the skeleton, if that is where it takes its colour from."""
+    if not shaded:
+        return margin_for(0)
+    farthest = np.max(np.abs(np.asarray(profile.distance)), where=np.asarray(profile.valid), initial=0)
+    return margin_for(int(farthest) + 2) if np.isfinite(farthest) else None
+
+
+def _check_sheets(gbuffer, descriptor, shape) -> None:
     if gbuffer is None and descriptor is None:
-        return None
+        return
     check_type("gbuffer", gbuffer, GBuffer)
     check_type("descriptor", descriptor, Descriptor)
     check_shape("gbuffer.depth", gbuffer.depth, shape)
     check_shape("descriptor.silhouette", descriptor.silhouette, shape)
-    return depth_barriers(gbuffer, descriptor)
 
 
 def _check_brush(brush, shading, noise) -> None:

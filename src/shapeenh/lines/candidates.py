@@ -18,7 +18,8 @@ from shapeenh.lines.tiles import list_tiles, margin_for, over_tiles
 from shapeenh.numerics import normalize, smoothstep
 
 GAMMA_MAX = 1.0  # the accumulated singularity that ends a trajectory (TH10 7.2.2)
-CHUNK = 1 << 13  # pixels that are fitted at a time
+CHUNK = 1 << 12  # pixels that are fitted at a time
+FREE, HELD = 1, 2  # candidates without and with a singularity near
 _OVERSHOOT = 1.3  # a maximum of a cubic fitted to heights within [0, 1] is below 1.28, for 5 to 65 samples
 
 # ------------------------------------------------------------------------------------------- what is read
@@ -87,15 +88,16 @@ def read(plane, row, col):
 
 
 def looked_at(field, least, radius):
-    """(what `planes_of` and what `_candidates` returns), worked out only near heights that a line can come from."""
+    """(heights and singularities as `planes_of` returns them, what `_candidates` returns), worked out only near heights
+    that a line can come from."""
     reach = int(np.ceil(radius)) + 1  # px, how far a fit reads
     margin = margin_for(reach + 3)
     tiles = None if margin is None else list_tiles(_high(field, least), margin, around=2 * reach + 3)
     if tiles is None:
         planes = _stored_planes(field)
-        return planes, _candidates(planes, least, radius=radius)
-    *planes, possible, held = _tiled(field, least, tiles, margin=margin, radius=radius)
-    return tuple(planes), (possible, held)
+        return planes[:2], _candidates(planes, least, radius=radius)
+    *planes, candidates = _tiled(field, least, tiles, margin=margin, radius=radius)
+    return tuple(planes), candidates
 
 
 @jax.jit
@@ -103,8 +105,9 @@ def _high(field, least):
     """Where a height may make a profile higher than `least`, [H, W] bool.
 
     Where all are within ±m, those that are extrapolated from them are within ±3 m, and a cubic over both below 5 m.
+    Where all are 0, nothing varies, and no profile is higher than any `least`.
     """
-    return (field.singularity < 1) & ((jnp.abs(field.height) > 0.2 * least) | (least <= 0))
+    return (field.singularity < 1) & (jnp.abs(field.height) > 0.2 * jnp.maximum(least, 0))
 
 
 @partial(jax.jit, static_argnames=("margin", "radius"))
@@ -113,27 +116,29 @@ def _tiled(field, least, tiles, *, margin, radius):
 
     def look(field):
         planes = stored(always, planes_of, field)
-        return *planes, *stored(always, partial(_candidates, radius=radius), planes, least)
+        return *planes[:2], stored(always, partial(_candidates, radius=radius), planes, least)
 
-    return over_tiles(look, field, tiles, (0, 1, 0, 0, False, False), margin=margin)
+    return over_tiles(look, field, tiles, (0, 1, 0), margin=margin)
 
 
-def list_pixels(candidates, held):
+def list_pixels(candidates):
     """(pixels [n] int32, chunks [2] int32): first those that no singularity is near, then the others."""
-    size = candidates.size
-    listed = np.full(CHUNK * (size // CHUNK + 3), size, np.int32)  # one length per image: nothing recompiles
-    found = np.flatnonzero(candidates)
-    held = held.ravel()[found]
+    found = np.flatnonzero(candidates != 0)
+    held = candidates.ravel()[found] == HELD
     free, near = found[~held], found[held]
+    # one of two lengths per image: little recompiles, and few pixels make a short list
+    lengths = (CHUNK * (size // CHUNK + 3) for size in (candidates.size // 8, candidates.size))
+    start, chunks = -(-free.size // CHUNK), -(-near.size // CHUNK)
+    listed = np.full(next(n for n in lengths if n >= (start + chunks) * CHUNK), candidates.size, np.int32)
     listed[: free.size] = free
-    start = -(-free.size // CHUNK)
     listed[start * CHUNK : start * CHUNK + near.size] = near
-    return jnp.asarray(listed), jnp.asarray([start, -(-near.size // CHUNK)], jnp.int32)
+    return listed, np.asarray([start, chunks], np.int32)
 
 
 @partial(jax.jit, static_argnames=("radius",))
 def _candidates(planes, least, *, radius):
-    """(where a profile higher than `least` is possible, where a singularity may end a neighbourhood), [H, W] bool."""
+    """[H, W] uint8: where a profile higher than `least` is possible, FREE or, where a singularity may end the
+    neighbourhood, HELD; else 0."""
     h, w = planes[2].shape
     # A sample lies within ceil(radius) pixels of its pixel, and is read from the four pixels around it.
     highest = _box(jnp.maximum, planes[0], int(np.ceil(radius)), h, w)
@@ -144,7 +149,8 @@ def _candidates(planes, least, *, radius):
     steps = int(np.ceil(radius))
     faint = min(0.1, 0.9 * GAMMA_MAX / (steps + 1))  # `_barrier` adds these as they are, and they never add up to 1
     held = _box(jnp.maximum, planes[1], steps, h, w) > faint
-    return possible & defined & (planes[1][1:-1, 1:-1] < GAMMA_MAX), held
+    possible &= defined & (planes[1][1:-1, 1:-1] < GAMMA_MAX)
+    return jnp.where(possible, jnp.where(held, HELD, FREE), 0).astype(jnp.uint8)
 
 
 def _box(pick, padded, reach: int, h: int, w: int):

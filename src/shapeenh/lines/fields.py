@@ -238,12 +238,15 @@ def _depth_steps(mask, depth, silhouette):
     return found
 
 
-def depth_barriers(gbuffer, descriptor):
+def depth_barriers(gbuffer, descriptor, *, near=None, around: int = 0):
     """(across, down), [H, W] bool: whether between a pixel and the one to its right, or below, there is a step of depth
-    or the outline. No gradient."""
+    or the outline. No gradient.
+
+    near: [H, W] bool; only up to `around` pixels from where it is set need the answer be right. None: everywhere.
+    """
     surface = gbuffer.mask, gbuffer.depth, descriptor.silhouette
-    if is_concrete(surface):
-        tiles = list_tiles(gbuffer.mask, _MARGIN, around=1)
+    if is_concrete(surface, near):
+        tiles = list_tiles(near, _MARGIN, around=around)
         if tiles is not None:
             return _tiled_barriers(surface, tiles)
     return _barriers(surface)

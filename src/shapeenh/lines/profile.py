@@ -15,8 +15,10 @@ import numpy as np
 from jax import lax
 
 from shapeenh.checks import check_choice, check_range, check_shape, check_size, check_type, float_dtype, is_concrete
+from shapeenh.fusion import stored, unknown_truth
 from shapeenh.lines.candidates import CHUNK, GAMMA_MAX, list_pixels, looked_at, planes_of, read
-from shapeenh.numerics import smoothstep
+from shapeenh.lines.tiles import different
+from shapeenh.numerics import normalize, smoothstep
 from shapeenh.types import LineField, Profile
 
 LEAST_REACH = 1.0  # px: a neighbourhood narrower than this shows no neighbour on either side, hence no profile
@@ -61,15 +63,16 @@ def fit_profile(field, *, radius: float = 4.0, samples: int = 9, least=0.0) -> P
     if is_concrete(least) and (np.isnan(least) or least == np.inf):
         raise ValueError(f"least is {least}; accepted are finite numbers and -inf")
     dtype = float_dtype(field.height)
-    least = jnp.asarray(least, dtype)
+    concrete = is_concrete(field, least)
+    least = np.asarray(least, dtype) if concrete else jnp.asarray(least, dtype)
     options = {"radius": float(radius), "samples": samples}
     if h == 0 or w == 0:
         raise ValueError(f"field.height has shape {(h, w)}; accepted are images of at least one pixel")
-    if not is_concrete(field, least):
+    if not concrete:
         return _fit_everywhere(field, least, **options)
     planes, candidates = looked_at(field, least, float(radius))
-    listed, counts = list_pixels(*map(np.asarray, candidates))
-    return _fit_listed(planes, listed, counts, least, **options)
+    listed, counts = list_pixels(np.asarray(candidates))
+    return _fit_listed(planes, field.direction, listed, counts, least, **options)
 
 
 @partial(jax.jit, static_argnames=("radius", "samples"))
@@ -83,21 +86,19 @@ def _fit_everywhere(field, least, *, radius, samples) -> Profile:
 
 
 @partial(jax.jit, static_argnames=("radius", "samples"))
-def _fit_listed(planes, listed, counts, least, *, radius, samples) -> Profile:
+def _fit_listed(planes, direction, listed, counts, least, *, radius, samples) -> Profile:
     """`_fit` at the listed pixels alone, in chunks that stay in the cache."""
-    height, _, theta_x, theta_y = planes
-    h, w = theta_x.shape
-    theta_x, theta_y = theta_x.ravel(), theta_y.ravel()
+    h, w = direction.shape[:2]
+    always = unknown_truth(planes[0], least)
 
     def chunk(k, out, *, held):
         index = lax.dynamic_slice_in_dim(listed, k * CHUNK, CHUNK)
         inside = jnp.minimum(index, h * w - 1)
-        theta = theta_x[inside], theta_y[inside]
+        theta = stored(always, lambda index: normalize(direction.reshape(h * w, 2)[index]).T, inside)
         found = _fit(planes, inside // w, inside % w, *theta, least, radius=radius, samples=samples, held=held)
         return tuple(o.at[index].set(f, mode="drop", unique_indices=False) for o, f in zip(out, found, strict=True))
 
-    empty = jnp.zeros(h * w, height.dtype)
-    out = (empty, empty, empty, jnp.zeros(h * w, bool))
+    out = *(jnp.full(h * w, b, planes[0].dtype) for b in different((0, 0, 0), least)), jnp.zeros(h * w, bool)
     out = lax.fori_loop(0, counts[0], partial(chunk, held=False), out)
     out = lax.fori_loop(counts[0], counts[0] + counts[1], partial(chunk, held=True), out)
     return Profile(*(o.reshape(h, w) for o in out))

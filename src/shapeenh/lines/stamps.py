@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -74,9 +73,6 @@ def stamps_planes(profile, field, brush, shading, noise, *, colored, turned, mov
         theta_x, theta_y = cos * theta_x - sin * theta_y, sin * theta_x + cos * theta_y
     turn = jnp.stack([-theta_y, theta_x]) if turned else None
     return Stamps(weight, radius if grown else None, color, turn, shift)
-
-
-stamps_of = partial(jax.jit, static_argnames=("colored", "turned", "moved", "grown"))(stamps_planes)
 
 
 def _at_skeleton(shading, distance, theta_x, theta_y):

@@ -1,8 +1,7 @@
 """Work only where something is: tiles that cover the flagged pixels of an image, each read with a margin around it.
 
 Stencils follow one another within a tile while it is in the cache. The sizes of tiles are compiled in, their places and
-their number are not: the cost follows the covered pixels, and nothing recompiles when they move. Imports nothing of
-ours.
+their number are not: the cost follows the covered pixels, and nothing recompiles when they move. Imports `fusion` only.
 """
 
 from __future__ import annotations
@@ -12,8 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from shapeenh.fusion import unknown_truth
+
 TILE = (96, 128)  # with a margin of 16 its planes take 80 KiB each
-_MARGINS = (8, 12, 16, 24, 32, 40)
+_MARGINS = (0, 8, 12, 16, 24, 32, 40)
 _WORTH = 1.25  # from this many times the image's pixels on, margins included, tiles cost more than the image
 
 
@@ -42,7 +43,7 @@ def list_tiles(flags, margin: int | None, *, around: int = 0):
     most = -(-size[0] // TILE[0]) * -(-size[1] // TILE[1])
     corners = np.zeros((most, 2), np.int32)  # one length per image: nothing recompiles
     corners[: len(found)] = np.reshape(found, (-1, 2))
-    return jnp.asarray(corners), jnp.asarray(len(found), jnp.int32)
+    return corners, np.int32(len(found))
 
 
 def _wider(line: np.ndarray, by: int) -> np.ndarray:
@@ -61,12 +62,13 @@ def _starts(line: np.ndarray, length: int) -> list[int]:
     return found
 
 
-def over_tiles(function, images, tiles, background, *, margin: int):
-    """`function(images)` in the tiles, and the values of `background` elsewhere.
+def over_tiles(function, images, tiles, background, *, margin: int, rim=((0, 0), (0, 0))):
+    """`function(images)` in the tiles, and the values of `background` elsewhere and in a rim around the image.
 
     function: a tree of images [h, w, ...] to a tuple of such, or of such with one more pixel all around, whose values
         depend on those up to `margin` px away and on whether the image ends there: windows keep within the image, so
         that its border stays a border.
+    rim: pixels above and below, and left and right of the image.
     """
     corners, count = tiles
     shape = np.asarray(jax.tree.leaves(images)[0].shape[:2])
@@ -80,10 +82,11 @@ def over_tiles(function, images, tiles, background, *, margin: int):
         corner = [corners[k, i] for i in (0, 1)]
         start = [jnp.clip(corner[i] - margin, 0, int(shape[i] - size[i])) for i in (0, 1)]
         inner = [corner[i] - start[i] for i in (0, 1)]
+        place = [corner[i] + rim[i][0] for i in (0, 1)]
         found = function(jax.tree.map(lambda image: cut(image, start, size), images))
         return tuple(
             lax.dynamic_update_slice(
-                whole, cut(part, inner, part.shape[:2] - size + TILE), (*corner, *(0,) * (part.ndim - 2))
+                whole, cut(part, inner, part.shape[:2] - size + TILE), (*place, *(0,) * (part.ndim - 2))
             )
             for whole, part in zip(out, found, strict=True)
         )
@@ -91,7 +94,17 @@ def over_tiles(function, images, tiles, background, *, margin: int):
     part = jax.tree.map(lambda image: jax.ShapeDtypeStruct((*size, *image.shape[2:]), image.dtype), images)
     shapes = jax.eval_shape(function, part)
     out = tuple(
-        jnp.full((*(shape + s.shape[:2] - size), *s.shape[2:]), b, s.dtype)
-        for s, b in zip(shapes, background, strict=True)
+        jnp.full((*(shape + np.sum(rim, axis=1) + s.shape[:2] - size), *s.shape[2:]), b, s.dtype)
+        for s, b in zip(shapes, different(background, count), strict=True)
     )
     return lax.fori_loop(0, count, one, out)
+
+
+def different(numbers, *arrays) -> list:
+    """The same numbers, but the compiler takes them for different ones: of planes that are filled alike it makes one,
+    and copies it, which takes three times as long as to fill another one.
+
+    arrays: one of them at least is not a constant of the program.
+    """
+    always = unknown_truth(*arrays)
+    return [b if isinstance(b, bool) else jnp.where(always, b, b + 1 + k) for k, b in enumerate(numbers)]
