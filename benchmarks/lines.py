@@ -1,7 +1,7 @@
 """Lines, stage by stage: `python -m benchmarks.lines [MESH ...] [--size WxH] [--kind KIND]`.
 
 Warm medians, compile apart; then the same from farther and farther away, where fewer pixels are near lines, in an image
-of the same size; then straight lines, more and more of them, with footprints of several sizes. TH10 8.4 reports 56
+of the same size; then an object of always as many pixels in larger and larger images; then straight lines, more and more of them, with footprints of several sizes. TH10 8.4 reports 56
 frames per second (18 ms) for one kind of line at 1024 x 768 with a footprint of 10 px and 10 diffusion steps, on its
 GPU (82 without diffusion). Ten steps of 1/5 are sigma = 2 here.
 """
@@ -17,6 +17,7 @@ import shapeenh as se
 from benchmarks import harness
 
 THESIS_MS = 1000 / 56
+BYTES = 4 * (4 + 3 + 4) + 1  # of a LineField, a Profile and a picture in float32
 SIGMA = 2.0
 DIRECTION = np.array([0.34, 0.26, 0.90])
 
@@ -62,6 +63,28 @@ def distances(mesh, kind: str, *, width: int, height: int) -> list[dict]:
         calls |= {(away, stage): call for stage, call in own.items()}
     times = harness.measure(calls, repeats=7, seconds=40)
     return [{"distance": away, "stage": stage, **facts[away], **times[away, stage]} for away, stage in calls]
+
+
+def sizes(mesh, kind: str) -> list[dict]:
+    """The stages for as many pixels near lines, in larger and larger images: what the rest of the image costs."""
+    calls, facts = {}, {}
+    for height in (384, 768, 1152):
+        size = f"{height * 4 // 3}x{height}"
+        own, facts[size] = stages(mesh, kind, width=height * 4 // 3, height=height, away=height / 192)
+        facts[size] |= {"megapixels": round(height * height * 4 / 3e6, 3)}
+        calls |= {(size, stage): call for stage, call in own.items()}
+    times = harness.measure(calls, repeats=9, seconds=20)
+    return [{"size": size, "stage": stage, **facts[size], **times[size, stage]} for size, stage in calls]
+
+
+def per_megapixel(rows: list[dict]) -> dict[str, float]:
+    """Milliseconds that a million more pixels of background cost, stage by stage."""
+    found = {}
+    for stage in dict.fromkeys(row["stage"] for row in rows):
+        first, *_, last = (row for row in rows if row["stage"] == stage)
+        more = last["megapixels"] - first["megapixels"]
+        found[stage] = round((last["min_ms"] - first["min_ms"]) / more, 2)
+    return found
 
 
 def of_all_pixels(rows: list[dict]) -> dict[str, float]:
@@ -124,17 +147,22 @@ def main() -> None:
     far = distances(next(iter(meshes.values())), arguments.kind, width=width, height=height)
     print(harness.table(far))
     print("ms that do not follow the pixels near lines:", of_all_pixels(far))
+    large = sizes(next(iter(meshes.values())), arguments.kind)
+    print(harness.table(large))
+    print("ms per megapixel of background:", per_megapixel(large))
     stripes = scaling()
     print(harness.table(stripes))
     print("growth of the cost with the pixels near lines (1 is linear) and with the radius:", growth(stripes))
     print(f"TH10 8.4, its GPU: {THESIS_MS:.1f} ms per frame")
     facts = {"size": arguments.size, "kind": arguments.kind, "thesis_ms": THESIS_MS, "growth": growth(stripes)}
     facts |= {"of_all_pixels_ms": of_all_pixels(far), "distances": far}
+    facts |= {"per_megapixel_ms": per_megapixel(large), "sizes": large}
     whole = "lines: field, fit, draw"
     took = next(row["median_ms"] for row in rows if row["stage"] == whole)
     said = (
         f"One kind takes {took:.0f} ms where TH10's GPU took {THESIS_MS:.0f}; of that "
-        f"{of_all_pixels(far)[whole]:.0f} ms do not follow the pixels near lines."
+        f"{of_all_pixels(far)[whole]:.0f} ms do not follow the pixels near lines. A million more pixels of background "
+        f"cost {per_megapixel(large)[whole]:.1f} ms: the field, the profile and the picture take {BYTES} bytes per pixel."
     )
     print(harness.write("lines", [*rows, *stripes], **facts, answer=said))
     print(said)

@@ -8,6 +8,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 import shapeenh as se
+from shapeenh.lines import smoothing
 from shapeenh.lines.tiles import list_tiles
 from shapeenh.types import GBuffer, replace
 from tests.reference import lines as reference
@@ -301,6 +302,38 @@ def test_a_small_object_in_a_large_frame_has_the_lines_of_the_frame_cut_to_it(ki
         around = np.ones(shape, bool)
         around[cut] = False
         assert len(np.unique(np.asarray(ours)[around])) == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "sigma"),
+    [("luminance", 1.0), ("own", 6.0), *(pytest.param("valley", s, marks=pytest.mark.slow) for s in (1.0, 6.0))],
+)
+def test_a_small_relief_on_a_wide_plane_is_found_without_a_mask(kind, sigma, monkeypatch):
+    """What is flat is left out, also where no mask says so, and without a trace."""
+    row, col = np.mgrid[0:400, 0:520].astype(float)
+    bump = 3 * np.clip(1 - np.hypot(row - 170, col - 260) / 20, 0, 1) ** 2
+    bump[230, 300] = np.nan if kind == "luminance" else 0
+
+    def field():
+        if kind == "luminance":
+            return se.line_field("luminance", None, None, luminance=np.float32(bump), sigma=sigma)
+        if kind == "own":
+            theta = np.where(bump[..., None] > 0, [0.6, 0.8], 0.0)
+            return se.make_line_field(np.float32(bump), np.float32(theta), sigma=sigma)
+        gbuffer = se.gbuffer_from_height(jnp.asarray(bump, jnp.float32))
+        return se.line_field(kind, gbuffer, se.describe(gbuffer), sigma=sigma)
+
+    used = []
+    monkeypatch.setattr(smoothing, "list_tiles", lambda *a, **k: used.append(list_tiles(*a, **k)) or used[-1])
+    tiled = field()
+    assert used[-1] is not None
+    monkeypatch.setattr(smoothing, "list_tiles", lambda *_, **__: None)
+    whole = field()
+    known = np.asarray(whole.height) > (1e-6 if kind == "own" else 0)  # there directions of tiny heights are kept
+    for name in ("height", "direction", "singularity"):
+        ours, expected = (np.asarray(getattr(f, name)) for f in (tiled, whole))
+        every = name == "height" or kind != "own"
+        np.testing.assert_allclose(*(a if every else a[known] for a in (ours, expected)), atol=1e-6)
 
 
 # ------------------------------------------------------------------------------------------- gradients, edge cases

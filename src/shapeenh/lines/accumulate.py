@@ -39,11 +39,11 @@ def crossings(barriers):
     return jnp.cumsum(across, axis=1) - across, jnp.cumsum(down, axis=0) - down
 
 
-def crossings_on_host(across: np.ndarray, down: np.ndarray, reach: int):
+def crossings_on_host(barriers: tuple[np.ndarray, ...], reach: int):
     """`crossings` of concrete barriers, in the frame of `rim`, modulo 256, which is as good: no footprint spans that
     many. The rows outside those that hold barriers cost nothing. No stamp lies in the rim, so any count may.
     """
-    h, w = across.shape
+    (across, down), (h, w) = barriers, barriers[0].shape
     counts = [np.zeros([n + sum(sides) for n, sides in zip((h, w), rim(w, reach), strict=True)], np.int8) for _ in "xy"]
     inner = [count[reach : reach + h, reach : reach + w] for count in counts]
     used = np.flatnonzero(across.any(axis=1) | down.any(axis=1))

@@ -139,12 +139,12 @@ def draw_lines(
         return draw_everywhere(profile, field, brush, shading, noise, image, barriers, **options)
     valid, margin = np.asarray(profile.valid), _margin(profile, wants["colored"] and float(brush.shade) > 0)
     tiles = list_tiles(valid, margin)
-    images, wants = (profile, field, shading, noise), tuple(wants.items())
-    stamps = framed_stamps(images, brush, tiles, wants=wants, margin=margin, reach=reach)
+    images = profile, field, shading, noise
+    stamps = framed_stamps(images, brush, tiles, wants=tuple(wants.items()), margin=margin, reach=reach)
     barriers = crossed = None
     if gbuffer is not None:
         barriers = tuple(map(np.asarray, depth_barriers(gbuffer, descriptor, near=valid, around=reach + 1)))
-        crossed = crossings_on_host(*barriers, reach)
+        crossed = crossings_on_host(barriers, reach)
     weight = np.asarray(stamps.weight)[reach:, reach:][: shape[0], : shape[1]]
     listed, counts = list_runs(weight, valid, barriers, reach)
     return draw_listed(stamps, listed, counts, brush, noise, image, crossed, shape=shape, **options)

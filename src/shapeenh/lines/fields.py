@@ -78,10 +78,10 @@ def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=1.0) -> 
         if luminance is not None:
             check_shape("luminance", luminance, (h, w))
         dtype = float_dtype(descriptor.hessian)
-    flags = None if gbuffer is None else gbuffer.mask
+    mask = None if gbuffer is None else gbuffer.mask
     spread = _STEP_SIGMA if kind == "occlusion" else 0.0
     images = gbuffer, descriptor, luminance
-    return smoothed_field(_measure, images, jnp.asarray(sigma, dtype), flags, spread=spread, kind=kind)
+    return smoothed_field(_measure, images, jnp.asarray(sigma, dtype), mask, _anything, spread=spread, kind=kind)
 
 
 def make_line_field(height, direction, *, mask=None, silhouette=None, sigma=0.0) -> LineField:
@@ -109,7 +109,34 @@ def make_line_field(height, direction, *, mask=None, silhouette=None, sigma=0.0)
     height, direction = jnp.asarray(height, dtype), jnp.asarray(direction, dtype)
     mask = jnp.ones(shape, bool) if mask is None else jnp.asarray(mask) != 0
     silhouette = jnp.zeros(shape, dtype) if silhouette is None else jnp.asarray(silhouette, dtype)
-    return smoothed_field(_take, (height, direction, mask, silhouette), jnp.asarray(sigma, dtype), mask)
+    images = height, direction, mask, silhouette
+    return smoothed_field(_take, images, jnp.asarray(sigma, dtype), mask, _anything_given, empty=1.0)
+
+
+# ------------------------------------------------------------------------------------------- where anything is
+
+
+@partial(jax.jit, static_argnames=("kind",))
+def _anything(gbuffer, descriptor, luminance, *, kind):
+    """Where, within the reach of stencils, there may be a height or a silhouette, [H, W] bool."""
+    if kind == "luminance":
+        found = _differs(luminance) | ~jnp.isfinite(luminance)
+    elif kind == "occlusion":
+        found = _differs(gbuffer.mask)
+    else:
+        found = jnp.any((descriptor.gradient if kind == "surface" else descriptor.hessian) != 0, axis=-1)
+    return found if gbuffer is None else found | (descriptor.silhouette != 0)
+
+
+@jax.jit
+def _anything_given(height, direction, mask, silhouette):
+    return mask & ((height != 0) | jnp.any(direction != 0, axis=-1) | (silhouette != 0))
+
+
+def _differs(image):
+    """From the pixel to the right or the one below."""
+    right, below = (jnp.pad(jnp.diff(image, axis=a) != 0, [(0, int(a == i)) for i in (0, 1)]) for a in (1, 0))
+    return right | below
 
 
 @partial(jax.jit, static_argnames=("kind",))

@@ -94,8 +94,8 @@ def _fit_listed(planes, direction, listed, counts, least, *, radius, samples) ->
     def chunk(k, out, *, held):
         index = lax.dynamic_slice_in_dim(listed, k * CHUNK, CHUNK)
         inside = jnp.minimum(index, h * w - 1)
-        theta = stored(always, lambda index: normalize(direction.reshape(h * w, 2)[index]).T, inside)
-        found = _fit(planes, inside // w, inside % w, *theta, least, radius=radius, samples=samples, held=held)
+        x, y = stored(always, lambda index: normalize(direction.reshape(h * w, 2)[index]).T, inside)
+        found = _fit(planes, inside // w, inside % w, x, y, least, radius=radius, samples=samples, held=held)
         return tuple(o.at[index].set(f, mode="drop", unique_indices=False) for o, f in zip(out, found, strict=True))
 
     out = *(jnp.full(h * w, b, planes[0].dtype) for b in different((0, 0, 0), least)), jnp.zeros(h * w, bool)

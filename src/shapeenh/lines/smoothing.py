@@ -25,30 +25,39 @@ LEAST_HEIGHT = 1e-5  # slopes and curvatures per px below this are rounding, not
 _STENCILS = 5  # px, how far all that is not diffusion reads: derivatives or steps of depth, and neighbours' directions
 
 
-def smoothed_field(first, images, sigma, flags, *, spread: float = 0.0, **options) -> LineField:
+def smoothed_field(first, images, sigma, mask, anything, *, empty=0.0, spread=0.0, **options) -> LineField:
     """The field that `first(*images, sigma, **options)` measures, smoothed; only where something is, if that is known.
 
-    flags: [H, W] bool, where anything is measured; or None: everywhere. spread: px, beyond which sigma `first` diffuses
-        more; then what it measures also extends over the rest of the image, where there is no line.
+    mask: [H, W] bool, where anything can be; or None: everywhere. anything: images -> [H, W] bool, where heights,
+        directions and silhouettes are not all 0; asked if the mask leaves nothing out. empty: the singularity where
+        they are. spread: px, beyond which sigma `first` diffuses more; then what it measures also extends off the mask.
     """
     tiles, margin = None, None
-    if flags is not None and is_concrete(images, sigma):
-        steps = math.ceil(0.5 * (float(sigma) ** 2 + spread**2) / STEP)
-        margin = margin_for(steps + _STENCILS)
-        tiles = list_tiles(flags, margin, around=steps + _STENCILS if spread else 0)
+    if is_concrete(images, sigma):
+        reach = _farthest(math.hypot(sigma, spread), sigma.dtype) + _STENCILS
+        margin = margin_for(reach)
+        tiles = list_tiles(mask, margin, around=reach if spread else 0)
+        if tiles is None and margin is not None:
+            tiles = list_tiles(anything(*images, **options), margin, around=reach)
     if tiles is None:
         return _assemble(first, *images, sigma, **options)
-    background = 0.0, 0.0, 0.0 if spread else 1.0
-    static = {"first": first, "margin": margin, "background": background, "options": tuple(options.items())}
-    return LineField(*_tiled(images, sigma, tiles, **static))
+    static = {"first": first, "margin": margin, "singularity": (empty, 0.0 if spread else 1.0)}
+    return LineField(*_tiled(images, mask, sigma, tiles, options=tuple(options.items()), **static))
 
 
-@partial(jax.jit, static_argnames=("first", "margin", "background", "options"))
-def _tiled(images, sigma, tiles, *, first, margin, background, options):
+def _farthest(sigma: float, dtype) -> int:
+    """How far diffusion carries anything, px: one per step, and from beyond so many sigma nothing but rounding."""
+    return min(math.ceil(0.5 * sigma**2 / STEP), math.ceil((6.5 if dtype == jnp.float32 else 9) * sigma))
+
+
+@partial(jax.jit, static_argnames=("first", "margin", "singularity", "options"))
+def _tiled(images, mask, sigma, tiles, *, first, margin, singularity, options):
     def field(images):
         found = _assemble(first, *images, sigma, **dict(options))
         return found.height, found.direction, found.singularity
 
+    on, off = singularity
+    background = 0.0, 0.0, on if mask is None or on == off else jnp.where(mask, on, off)
     return over_tiles(field, images, tiles, background, margin=margin)
 
 

@@ -13,14 +13,19 @@ from jax import lax
 
 from shapeenh.fusion import unknown_truth
 
-TILE = (96, 128)  # with a margin of 16 its planes take 80 KiB each
-_MARGINS = (0, 8, 12, 16, 24, 32, 40)
+_TILE = (96, 128)  # with a margin of 16 its planes take 80 KiB each
+_MARGINS = (0, 8, 12, 16, 24, 32, 40, 64, 96, 144)
 _WORTH = 1.25  # from this many times the image's pixels on, margins included, tiles cost more than the image
 
 
 def margin_for(reach: int) -> int | None:
     """A margin of at least `reach` pixels, one of few, since it is compiled in; None: too wide for tiles."""
     return next((m for m in _MARGINS if m >= reach), None)
+
+
+def _tile(margin: int) -> np.ndarray:
+    """[2], the size of tiles; those with wide margins are larger."""
+    return np.asarray(_TILE) * (1 if margin <= 40 else 2 if margin <= 64 else 4)
 
 
 def list_tiles(flags, margin: int | None, *, around: int = 0):
@@ -31,16 +36,16 @@ def list_tiles(flags, margin: int | None, *, around: int = 0):
     if flags is None or margin is None:
         return None
     flags = np.asarray(flags)
-    size = flags.shape
-    if any(n < t + 2 * margin for n, t in zip(size, TILE, strict=True)):
+    size, tile = flags.shape, _tile(margin)
+    if any(size < tile + 2 * margin):
         return None
     found = []
-    for row in _starts(_wider(flags.any(axis=1), around), TILE[0]):
-        band = flags[max(row - around, 0) : row + TILE[0] + around]
-        found += [(row, col) for col in _starts(_wider(band.any(axis=0), around), TILE[1])]
-    if len(found) * (TILE[0] + 2 * margin) * (TILE[1] + 2 * margin) > _WORTH * flags.size:
+    for row in _starts(_wider(flags.any(axis=1), around), tile[0]):
+        band = flags[max(row - around, 0) : row + tile[0] + around]
+        found += [(row, col) for col in _starts(_wider(band.any(axis=0), around), tile[1])]
+    if len(found) * np.prod(tile + 2 * margin) > _WORTH * flags.size:
         return None
-    most = -(-size[0] // TILE[0]) * -(-size[1] // TILE[1])
+    most = np.prod(-(-np.asarray(size) // tile))
     corners = np.zeros((most, 2), np.int32)  # one length per image: nothing recompiles
     corners[: len(found)] = np.reshape(found, (-1, 2))
     return corners, np.int32(len(found))
@@ -63,16 +68,16 @@ def _starts(line: np.ndarray, length: int) -> list[int]:
 
 
 def over_tiles(function, images, tiles, background, *, margin: int, rim=((0, 0), (0, 0))):
-    """`function(images)` in the tiles, and the values of `background` elsewhere and in a rim around the image.
+    """`function(images)` in the tiles, and `background`, numbers or images, elsewhere and in a rim around the image.
 
     function: a tree of images [h, w, ...] to a tuple of such, or of such with one more pixel all around, whose values
         depend on those up to `margin` px away and on whether the image ends there: windows keep within the image, so
         that its border stays a border.
     rim: pixels above and below, and left and right of the image.
     """
-    corners, count = tiles
+    (corners, count), tile = tiles, _tile(margin)
     shape = np.asarray(jax.tree.leaves(images)[0].shape[:2])
-    size = np.asarray(TILE) + 2 * margin
+    size = tile + 2 * margin
 
     def cut(image, start, size):
         rest = image.ndim - 2
@@ -86,7 +91,7 @@ def over_tiles(function, images, tiles, background, *, margin: int, rim=((0, 0),
         found = function(jax.tree.map(lambda image: cut(image, start, size), images))
         return tuple(
             lax.dynamic_update_slice(
-                whole, cut(part, inner, part.shape[:2] - size + TILE), (*place, *(0,) * (part.ndim - 2))
+                whole, cut(part, inner, part.shape[:2] - size + tile), (*place, *(0,) * (part.ndim - 2))
             )
             for whole, part in zip(out, found, strict=True)
         )
@@ -107,4 +112,4 @@ def different(numbers, *arrays) -> list:
     arrays: one of them at least is not a constant of the program.
     """
     always = unknown_truth(*arrays)
-    return [b if isinstance(b, bool) else jnp.where(always, b, b + 1 + k) for k, b in enumerate(numbers)]
+    return [b if isinstance(b, bool) or np.ndim(b) else jnp.where(always, b, b + 1 + k) for k, b in enumerate(numbers)]
