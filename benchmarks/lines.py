@@ -1,9 +1,10 @@
 """Lines, stage by stage: `python -m benchmarks.lines [MESH ...] [--size WxH] [--kind KIND]`.
 
 Warm medians, compile apart; then the same from farther and farther away, where fewer pixels are near lines, in an image
-of the same size; then an object of always as many pixels in larger and larger images; then straight lines, more and more of them, with footprints of several sizes. TH10 8.4 reports 56
-frames per second (18 ms) for one kind of line at 1024 x 768 with a footprint of 10 px and 10 diffusion steps, on its
-GPU (82 without diffusion). Ten steps of 1/5 are sigma = 2 here.
+of the same size; then an object of always as many pixels in larger and larger images; then straight lines, more and
+more of them, with footprints of several sizes. TH10 8.4 reports 56 frames per second (18 ms) for one kind of line at
+1024 x 768 with a footprint of 10 px and 10 diffusion steps, on its GPU (82 without diffusion). Ten steps of 1/5 are
+sigma = 2 here.
 """
 
 from __future__ import annotations
@@ -162,7 +163,7 @@ def main() -> None:
     said = (
         f"One kind takes {took:.0f} ms where TH10's GPU took {THESIS_MS:.0f}; of that "
         f"{of_all_pixels(far)[whole]:.0f} ms do not follow the pixels near lines. A million more pixels of background "
-        f"cost {per_megapixel(large)[whole]:.1f} ms: the field, the profile and the picture take {BYTES} bytes per pixel."
+        f"cost {per_megapixel(large)[whole]:.1f} ms: {BYTES} bytes each of field, profile and picture to be written."
     )
     print(harness.write("lines", [*rows, *stripes], **facts, answer=said))
     print(said)
