@@ -64,13 +64,13 @@ def _forward(start, stop, g, fixed, step):
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(5, 6))
-def explicit(planes, link_x, link_y, budget, weight, step=STEP, slots=(8, 8, 8, 8, 8)):
+def explicit(planes, link_x, link_y, budget, weight, step=STEP, slots=(10, 10, 10, 10)):
     """`planes` after each pixel has spent its time `budget` in explicit steps (SPEC 3.5, 3.6).
 
     planes: [C, H, W]; link_x: [H, W-1]; link_y: [H-1, W]; budget: [1, 1] or [H, W], time in px^2, sigma = sqrt(2 time).
     weight: [1, 1] or [H, W], what a pixel makes of one unit of inflow (1, or 1/volume); no gradient.
-    *Static*: step, the longest step; slots, how many states the reverse sweep keeps per level, coarsest first: their
-        product bounds the number of steps that can be differentiated with respect to links.
+    *Static*: step, the longest step; slots, how many states the reverse sweep keeps per level, coarsest first: the
+        number of steps that can be differentiated with respect to links is at most REPLAYED times their product.
     The number of steps is read at run time, so nothing recompiles when the budget changes; the last step is as
     short as it has to be, so the result is continuous in the budget.
     """
@@ -79,26 +79,37 @@ def explicit(planes, link_x, link_y, budget, weight, step=STEP, slots=(8, 8, 8, 
 
 # ------------------------------------------------------------------------------------------- reverse mode
 #
-# A is symmetric, so the cotangent lam is pulled back by the same operator, lam <- lam + A (dt lam): no state is needed.
-# The derivative with respect to a pixel's budget is lam (A g) at its last, short step: that one A g per pixel is kept
-# on the way forward. The derivative with respect to a link is -jump(dt lam) jump(g) summed over all steps: only where
-# it is asked for is g computed again, from states kept at a few steps.
+# A is symmetric. With one budget for all, a step takes g to g + dt w A g, and pulls a cotangent lam back to
+# lam + dt A (w lam): the same step, of w lam. So the cotangent is diffused, and no state is needed.
+# The derivative with respect to a pixel's budget is lam w (A g) at its last, short step: that one A g per pixel is kept
+# on the way forward. The derivative with respect to a link is -jump(dt w lam) jump(g) summed over all steps: only where
+# it is asked for is g computed again: kept at some steps, and for the few up to the next taken anew each time.
+
+REPLAYED = 4  # steps between the finest kept states: to take them again costs less than to store and load more states
 
 
 def _explicit_fwd(planes, link_x, link_y, budget, weight, step, slots):
     links_wanted, time_wanted = link_x.perturbed or link_y.perturbed, budget.perturbed
     planes, *fixed = (argument.value for argument in (planes, link_x, link_y, budget, weight))
     count = _count(fixed[2], step)
+    states, rate = None, None
     if fixed[2].shape == (1, 1):
         last = jnp.maximum(count - 1, 0)
-        states, g = _keep(0, count, last, planes, fixed, step, slots) if links_wanted else (None, None)
-        g = _forward(0, last, planes, fixed, step) if g is None else g
+        states, g = _keep(count, last, planes, fixed, step, slots, links_wanted)
         rate = divergence(g, *fixed[:2])
         out = _step(last, g, rate, fixed, step)
     else:
-        states, out = _keep(0, count, count, planes, fixed, step, slots) if links_wanted else (None, None)
-        out, rate = _forward_with_rate(planes, fixed, step) if time_wanted or out is None else (out, None)
+        states, out = _keep(count, count, planes, fixed, step, slots, links_wanted)
+        if time_wanted:
+            out, rate = _forward_with_rate(planes, fixed, step)
     return out, (fixed, states, rate if time_wanted else None)
+
+
+def _keep(count, stop, planes, fixed, step, slots, wanted: bool):
+    """(the states that the reverse sweep starts from, or None where they are not wanted; planes after step `stop`)."""
+    if not wanted or len(slots) < 2:
+        return planes if wanted else None, _forward(0, stop, planes, fixed, step)
+    return _keep_states(0, count, stop, planes, fixed, step, slots)
 
 
 def _forward_with_rate(planes, fixed, step):
@@ -120,44 +131,62 @@ def _is_last(budget, k, step):
 
 def _explicit_bwd(step, slots, saved, lam):
     fixed, states, rate = saved
-    budget, weight = fixed[2:]
+    link_x, link_y, budget, weight = fixed
     if isinstance(lam, SymbolicZero):
         lam = jnp.zeros(lam.shape, lam.dtype)
-    count = _count(budget, step)
+    count, uniform = _count(budget, step), budget.shape == (1, 1)
     d_budget = None
     if rate is not None:
-        d_budget = jnp.zeros_like(budget)
-        if budget.shape == (1, 1):
-            d_budget, rate = jnp.sum(weight[None] * lam * rate)[None, None], None
-    sums = None if states is None else tuple(jnp.zeros_like(link) for link in fixed[:2])
-    carry = lam, sums, d_budget
+        d_budget = jnp.sum(weight[None] * lam * rate)[None, None] if uniform else jnp.zeros_like(budget)
+    pulled = weight[None] * lam if uniform else lam
+    sums = None
     if states is None:
-        carry = lax.fori_loop(
-            0, count, lambda j, carry: _reverse_step(count - 1 - j, None, carry, fixed, rate, step), carry
-        )
+
+        def back(j, carry):
+            pulled, d_budget = carry
+            pulled, d_budget, _ = _pull(count - 1 - j, pulled, d_budget, fixed, rate, step)
+            return pulled, d_budget
+
+        pulled, d_budget = lax.fori_loop(0, count, back, (pulled, d_budget))
     else:
-        carry = _reverse(0, count, states, carry, fixed, rate, step, slots)
-    lam, sums, d_budget = carry
-    return lam, *(sums or (None, None)), d_budget, None
+        sums = jnp.zeros_like(link_x), jnp.zeros_like(link_y)
+        reverse = _reverse if len(slots) < 2 else _reverse_kept
+        pulled, sums, d_budget = reverse(0, count, states, (pulled, sums, d_budget), fixed, rate, step, slots)
+    if uniform:
+        some = weight[None] > 0
+        pulled = jnp.where(some, pulled / jnp.where(some, weight[None], 1), lam)
+    return pulled, *(sums or (None, None)), d_budget, None
 
 
-def _reverse_step(k, g, carry, fixed, rate, step):
+def _pull(k, pulled, d_budget, fixed, rate, step):
+    """One step back: (the cotangent, d_budget, what stands in the products with the jumps of g).
+
+    With one budget for all, the cotangent is w lam and the last of these times the step; else it is lam, and dt w lam.
+    """
     link_x, link_y, budget, weight = fixed
-    lam, sums, d_budget = carry
-    pulled = (_share(budget, k, step) * weight)[None] * lam
+    if budget.shape == (1, 1):
+        return _step(k, pulled, divergence(pulled, link_x, link_y), fixed, step), d_budget, pulled
     if rate is not None:
-        own = weight * _over_channels(lam * rate)
+        own = weight * _over_channels(pulled * rate)
         d_budget = d_budget + jnp.where(_is_last(budget, k, step), own, 0)
-    if sums is not None:
-        lam_x, lam_y = _jumps(pulled)
-        g_x, g_y = _jumps(g)
-        sums = sums[0] - _over_channels(lam_x * g_x), sums[1] - _over_channels(lam_y * g_y)
-    return lam + divergence(pulled, link_x, link_y), sums, d_budget
+    spent = (_share(budget, k, step) * weight)[None] * pulled
+    return pulled + divergence(spent, link_x, link_y), d_budget, spent
 
 
-def _keep(start, count, stop, g, fixed, step, slots):
-    """(g at the start of each stretch of prod(slots[1:]) steps, g after step `stop`), of `count` steps from `start`."""
-    span = math.prod(slots[1:])
+def _add_products(sums, g, factor, share):
+    """`sums`, the derivatives with respect to the links, with those of one step added."""
+    products = (_over_channels(a * b) for a, b in zip(_jumps(g), _jumps(factor), strict=True))
+    return tuple(total - share * product for total, product in zip(sums, products, strict=True))
+
+
+def _span(slots) -> int:
+    """How many steps lie between two states of the coarsest level."""
+    return REPLAYED * math.prod(slots[1:])
+
+
+def _keep_states(start, count, stop, g, fixed, step, slots):
+    """(g every `_span` steps, g after step `stop`), of `count` steps from `start`."""
+    span = _span(slots)
 
     def keep(i, kept):
         states, g = kept
@@ -168,30 +197,43 @@ def _keep(start, count, stop, g, fixed, step, slots):
     return lax.fori_loop(0, (count + span - 1) // span, keep, (jnp.zeros((slots[0], *g.shape), g.dtype), g))
 
 
-def _reverse(start, count, states, carry, fixed, rate, step, slots):
-    """Pull `carry` back through `count` steps that begin at `start`, with the states that `_keep` kept of them."""
-    span = math.prod(slots[1:])
+def _reverse_kept(start, count, states, carry, fixed, rate, step, slots):
+    """Pull `carry` back through `count` steps that begin at `start`, with the states that `_keep_states` kept."""
+    span = _span(slots)
     pieces = (count + span - 1) // span
 
     def back(j, carry):
         i = pieces - 1 - j
         first, g = start + i * span, stored(count > 0, lambda i: lax.dynamic_index_in_dim(states, i, 0, False), i)
-        if span == 1:
-            return _reverse_step(first, g, carry, fixed, rate, step)
-        inner = jnp.minimum(span, count - i * span)
-        last = first + (inner - 1) // math.prod(slots[2:]) * math.prod(slots[2:])
-        finer, _ = _keep(first, inner, last, g, fixed, step, slots[1:])
-        return _reverse(first, inner, finer, carry, fixed, rate, step, slots[1:])
+        return _reverse(first, jnp.minimum(span, count - i * span), g, carry, fixed, rate, step, slots[1:])
 
     return lax.fori_loop(0, pieces, back, carry)
+
+
+def _reverse(start, count, g, carry, fixed, rate, step, slots):
+    """Pull `carry` back through `count` steps that begin at `start` with `g`."""
+    if slots:
+        span = _span(slots)
+        states, _ = _keep_states(start, count, start + (count - 1) // span * span, g, fixed, step, slots)
+        return _reverse_kept(start, count, states, carry, fixed, rate, step, slots)
+
+    def back(j, carry):
+        k = start + count - 1 - j
+        pulled, sums, d_budget = carry
+        pulled, d_budget, factor = _pull(k, pulled, d_budget, fixed, rate, step)
+        share = _share(fixed[2], k, step) if fixed[2].shape == (1, 1) else 1
+        return pulled, _add_products(sums, _forward(start, k, g, fixed, step), factor, share), d_budget
+
+    return lax.fori_loop(0, count, back, carry)
 
 
 explicit.defvjp(_explicit_fwd, _explicit_bwd, symbolic_zeros=True)
 
 
-def slots_for(steps: int, most: int = 8) -> tuple[int, ...]:
+def slots_for(steps: float, most: int = 10) -> tuple[int, ...]:
     """`slots` of `explicit` for up to `steps` steps, none above `most`."""
-    depth = 1
-    while most**depth < steps:
+    stretches = math.ceil(steps / REPLAYED - 1e-6)
+    depth = 0
+    while most**depth < stretches:
         depth += 1
-    return (max(2, math.ceil(steps ** (1 / depth))),) * depth
+    return (max(2, math.ceil(stretches ** (1 / max(depth, 1)))),) * depth

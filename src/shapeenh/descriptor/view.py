@@ -155,7 +155,7 @@ def _smoothing(sigma, importance, scheme: str) -> tuple[int, bool, bool]:
         if known and importance is not None:
             most = float(np.max(importance, initial=0))
             steps = min(steps, most) if steps > 0 else most
-        return -max(1, math.ceil(math.log(max(steps, 1)) / math.log(8) + 1e-6)), True, chart
+        return -max(1, math.ceil(math.log10(max(steps, 1) / 4) + 1e-6)), True, chart
     return diffusion.levels_for(float(sigma) if known else diffusion.GREATEST_SIGMA), known, chart
 
 
