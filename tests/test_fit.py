@@ -1,5 +1,6 @@
 """Contrast, and parameters fitted to it or to a picture (SPEC 12)."""
 
+import argparse
 import json
 import re
 import subprocess
@@ -15,6 +16,7 @@ import pytest
 
 import shapeenh as se
 from shapeenh.cli import main
+from shapeenh.cli.fit import report
 from shapeenh.fit.box import Box
 from shapeenh.fit.search import shortest_step, survey_points
 from tests.reference import contrast as twin
@@ -746,6 +748,14 @@ def test_shapeenh_fit_finds_draws_and_prints(tmp_path, capsys, monkeypatch):
 
     assert main(["fit", "--target-contrast", "0.82", *small]) == 0
     assert re.match(r"alpha [\d.]+, gamma [\d.-]+: rms contrast 0\.82", capsys.readouterr().out)
+
+
+def test_shapeenh_fit_says_why_it_did_not_converge(capsys):
+    stopped = se.FitResult(se.LightWarp(3.0, 0.0), jnp.asarray(0.7), 4, 9, False, "the contrast jumps")
+    report(argparse.Namespace(json=False, measure="rms"), stopped, 0.5)
+    assert "(not converged: the contrast jumps)" in capsys.readouterr().out
+    report(argparse.Namespace(json=True, measure="rms"), stopped, 0.5)
+    assert json.loads(capsys.readouterr().out)["reason"] == "the contrast jumps"
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ def run(arguments) -> None:
     coverage = loaded.coverage and clock.stage("coverage", lambda: loaded.coverage(gbuffer))
     shown = render.side_by_side([plain, warped], exposure, gbuffer.mask, arguments, samples, coverage=coverage)
     clock.once("save", lambda: io.save_image(arguments.output, shown))
-    _report(arguments, found, original)
+    report(arguments, found, original)
 
 
 def _prepare(loaded, arguments, clock, samples: int):
@@ -91,7 +91,8 @@ def _check(arguments) -> None:
     io.check_picture_path(arguments.output)
 
 
-def _report(arguments, found, original: float) -> None:
+def report(arguments, found, original: float) -> None:
+    """Print what was found, as a sentence or as JSON."""
     record = {
         "alpha": float(found.parameters.alpha),
         "gamma": float(found.parameters.gamma),
@@ -100,11 +101,12 @@ def _report(arguments, found, original: float) -> None:
         "measure": arguments.measure,
         "renders": found.renders,
         "converged": found.converged,
+        "reason": found.reason,
     }
     if arguments.json:
         print(json.dumps(record, indent=2))
         return
-    ended = "" if found.converged else " (not converged)"
+    ended = "" if found.converged else f" (not converged: {found.reason})"
     print(
         f"alpha {record['alpha']:.4g}, gamma {record['gamma']:.4g}: {arguments.measure} contrast "
         f"{record['contrast']:.4g}{ended}, originally {original:.4g}; {found.renders} pictures rendered"
