@@ -39,7 +39,7 @@ def occluding(gbuffer, descriptor, camera) -> dict:
     """How far the points of occlusion lines are from steps of depth of more than a pixel, and those of more than five
     from the lines."""
     field = se.line_field("occlusion", gbuffer, descriptor)
-    profile = se.fit_profile(field, radius=2.0, least=0.05)
+    profile = se.fit_profile(field, radius=1.5, least=float(se.style_brush("ink", "occlusion").low))
     points = line_points(profile, field)
     off = KDTree(step_points(gbuffer, camera, 1.0)).query(points)[0]
     missed = KDTree(points).query(step_points(gbuffer, camera, 5.0))[0]
@@ -85,9 +85,11 @@ def main() -> None:
                 rows.append(row)
     print(harness.table(rows))
     least = {what: 100 * min(row[f"{what} right"] for row in rows) for what in ("ridge", "valley")}
+    least |= {what: 100 * min(row[what] for row in rows) for what in ("within 1 px", "steps drawn")}
     said = (
         f"In every scene at least {least['ridge']:.1f} % of the pixels of strong ridges are convex, and "
-        f"{least['valley']:.1f} % of those of strong valleys concave."
+        f"{least['valley']:.1f} % of those of strong valleys concave; {least['within 1 px']:.2f} % of the points of "
+        f"occlusion lines lie within a pixel of a step of depth, and {least['steps drawn']:.1f} % of steps have one."
     )
     print(harness.write("line_positions", rows, height=arguments.height, answer=said))
     print(said)

@@ -141,9 +141,9 @@ def object_lines(gbuffer, descriptor, picture, camera, arguments, kinds):
     strokes = jnp.zeros((height, width, 4), descriptor.hessian.dtype)
     for kind in kinds:
         image = luminance(picture) if kind == "luminance" else None
-        field = line_field(kind, gbuffer, descriptor, luminance=image, sigma=1.0)
+        field = line_field(kind, gbuffer, descriptor, luminance=image)
         brush = _brush(arguments, kind, height)
-        profile = fit_profile(field, radius=2.0 if kind == "occlusion" else 4.0, least=float(brush.low))
+        profile = fit_profile(field, radius=1.5 if kind == "occlusion" else 4.0, least=float(brush.low))
         inputs = {"footprint": style_footprint(arguments.style), "shading": picture, "noise": noise}
         if kind != "occlusion":  # those lie on the silhouettes, all others end there
             inputs |= {"gbuffer": gbuffer, "descriptor": descriptor}

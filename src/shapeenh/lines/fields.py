@@ -24,7 +24,7 @@ _STEP_SIGMA = 0.75  # px
 # ------------------------------------------------------------------------------------------- public
 
 
-def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=1.0) -> LineField:
+def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=None) -> LineField:
     """The field whose ridges are the lines of one kind.
 
     Source: TH10 table 7.1, 7.2.1; SPEC 9.
@@ -43,10 +43,10 @@ def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=1.0) -> 
         gbuffer: GBuffer; None for luminance without geometry (pictures, video).
         descriptor: Descriptor of the same image; None for luminance without geometry.
         luminance: [H, W], for kind "luminance" and no other.
-        sigma: [], px, in [0, 20]: heights and directions are diffused this far, insulated by silhouettes. (Occlusion
-            lines live *on* the silhouettes: they are diffused freely, background included, and by 0.75 px more, since a
-            step is thinner than any profile. Fit them with a radius of 2: steps less than 3 px apart become one line
-            between them, with larger radii sooner.)
+        sigma: [], px, in [0, 20]: heights and directions are diffused this far, insulated by silhouettes. None: 1, and
+            0 for occlusion. (Occlusion lines live *on* the silhouettes: they are diffused freely, background included,
+            and by 0.75 px more, since a step is thinner than any profile. Fit them with a radius of 1.5: steps less
+            than 2 px apart become one line between them, with larger radii and sigma sooner.)
 
     Static: kind.
     Returns: LineField [H, W]; 0 off the mask with singularity 1 there, except occlusion lines, which straddle the
@@ -58,6 +58,8 @@ def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=1.0) -> 
     >>> field = se.line_field("valley", gbuffer, se.describe(gbuffer, sigma=2.0))
     """
     check_choice("kind", kind, KINDS)
+    if sigma is None:
+        sigma = 0.0 if kind == "occlusion" else 1.0
     check_range("sigma", sigma, 0, GREATEST_SIGMA)
     check_shape("sigma", sigma, ())
     if (luminance is not None) != (kind == "luminance"):
@@ -217,6 +219,8 @@ def _occlusion(gbuffer, silhouette):
     """|g_d| and its direction, with every step of depth normalised to 1 and slopes taken off."""
     planes = []
     for axis, step in enumerate(_depth_steps(gbuffer.mask, gbuffer.depth, silhouette)):
+        # half marked at a pixel or two is the fold of a coarse mesh, not an edge
+        step = jnp.sign(step) * smoothstep(0.25, 0.75, jnp.abs(step))
         before, after = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
         before[axis], after[axis] = (1, 0), (0, 1)
         half = 0.5 * (jnp.pad(step, before) + jnp.pad(step, after))

@@ -10,10 +10,10 @@ from shapeenh.lines.fields import KINDS
 from shapeenh.types import replace
 
 # Heights at which a line of each kind begins to show, and is fully there, at an image height of 600 px. Occlusion lines
-# are steps normalised to 1, whose smoothed gradient is about a quarter at any resolution; slopes do not depend on it
+# are steps normalised to 1, whose smoothed gradient is about 0.4 at any resolution; slopes do not depend on it
 # either; curvatures are per px, and variations of curvature per px^2.
 _HEIGHTS = {
-    "occlusion": (0.04, 0.12),
+    "occlusion": (0.055, 0.16),
     "surface": (1.2, 4.0),
     "luminance": (0.008, 0.05),
     "ridge": (0.06, 0.35),
