@@ -24,9 +24,10 @@ from shapeenh import checks
 from shapeenh.buffers.gbuffer import surface
 from shapeenh.buffers.inputs import check_camera, check_mesh, check_table
 from shapeenh.buffers.project import clip_matrix
-from shapeenh.buffers.resolve import barycentrics, blend
+from shapeenh.buffers.resolve import blend
 from shapeenh.buffers.runs import listed, table_rows
 from shapeenh.buffers.visibility import CULL, check_cull, visible_triangles
+from shapeenh.buffers.weights import edge_products, weights
 from shapeenh.buffers.xla import take
 from shapeenh.fusion import stored, unknown_truth
 from shapeenh.types import Camera, Coverage, GBuffer, Mesh
@@ -221,19 +222,21 @@ def borrowed(always, vertices, normals, view, projection, m, position, normal, f
         """Camera-space position and normal of the samples, [6, S * S, n]."""
         dtype = vertices.dtype
 
-        def weights(m, position, fine_x, fine_y):
+        def edges(m, position, fine_x, fine_y):
             p = (fine_x.astype(dtype) + 0.5) * (2 / (width * samples)) - 1
             q = 1 - (fine_y.astype(dtype) + 0.5) * (2 / (height * samples))
             relative = []
             for axis, t in ((0, p), (1, q)):
                 k = [m[axis, c] - t * m[3, c] for c in range(4)]
                 relative.append(sum(k[c][:, None] * position[:, :, c] for c in range(3)) + k[3][:, None])
-            b, _, inverse, _ = barycentrics(*relative)
-            return jnp.stack([*b, inverse])
+            return edge_products(jnp.concatenate(relative, 1))
 
-        *b, inverse = stage(weights, m, rows[0], fine_x, fine_y)
-        _, place, n = surface(stage, view, b, [stage(blend, b, t) for t in rows], rows, inverse)[:3]
-        return stage(lambda *planes: jnp.stack(planes), *place, *n)
+        def write(function, *args):
+            return stage(lambda *args: jnp.stack(function(*args)), *args)
+
+        w = stage(weights, stage(edges, m, rows[0], fine_x, fine_y))
+        _, place, n = surface(stage, write, view, w, [stage(blend, w, t) for t in rows], rows)
+        return jnp.concatenate([place, n])
 
     def around(row, column):
         """Position, normal and whether there is anything, of the 3 x 3 pixels: [9, 6, n] and [9, n]."""

@@ -9,8 +9,9 @@ from jax import lax
 from shapeenh import checks
 from shapeenh.buffers.inputs import check_table
 from shapeenh.buffers.project import clip_matrix
-from shapeenh.buffers.resolve import resolve
+from shapeenh.buffers.resolve import Finish, resolve
 from shapeenh.buffers.visibility import rasterize
+from shapeenh.buffers.weights import planes, total_sums
 from shapeenh.types import Camera, GBuffer, Mesh
 
 GRAZING = 0.01  # the least n_z
@@ -69,41 +70,79 @@ def resolve_gbuffer(vertices, faces, tables, view, projection, triangle) -> GBuf
         made = [jnp.zeros((*triangle.shape, count), vertices.dtype) for count in channels.values()]
     else:
         m, _ = clip_matrix(view, projection)
-        made = resolve(surface, vertices, [tables[name] for name in names], view, m, faces, triangle)
+        made = resolve(SURFACE, vertices, [tables[name] for name in names], view, m, faces, triangle)
     fields = dict(zip(channels, made, strict=True))
     return GBuffer(mask=triangle >= 0, **{**fields, "depth": fields["depth"][..., 0]})
 
 
-def surface(stage, view, b, blended, rows, inverse):
-    """Depth, camera-space position and normal, then the other attributes as they are."""
+# ------------------------------------------------------------------------------------------- what the fields are
+
+
+def surface(stage, write, view, w, blended, rows):
+    """Depth, camera-space position and normal, then the other attributes as they are (`resolve.Finish`)."""
     point, normal, *others = blended
-
-    def turned(view, point, normal, rows, inverse):
-        side = lax.stop_gradient(viewer_side(rows[0], rows[1], inverse))
-        position = [sum(view[k, c] * point[:, c] for c in range(3)) + view[k, 3] for k in range(3)]
-        return jnp.stack(position + [sum(view[k, c] * normal[:, c] for c in range(3)) * side for k in range(3)], 1)
-
-    made = stage(turned, view, point, normal, rows[:2], inverse)
-    x, y, z, *n = (made[:, k] for k in range(6))
-
-    n = unit(stage, n)
-    n = unit(stage, [n[0], n[1], jnp.maximum(n[2], GRAZING)])
-    return [[-z], [x, y, z], n, *([t[:, k] for k in range(t.shape[1])] for t in others)]
+    made = stage(turned, view, point, normal, stage(viewer_side, rows[0], rows[1], w))
+    t = stage(lambda made: jnp.stack(scales(planes(made)[3:]), 1), made)
+    return [
+        write(lambda made: [-made[:, 2]], made),
+        write(lambda made: planes(made)[:3], made),
+        write(lambda made, t: scaled(planes(made)[3:], planes(t)), made, t),
+        *(write(planes, other) for other in others),
+    ]
 
 
-def viewer_side(position, normal, inverse):
+def surface_reverse(stage, view, w, blended, rows, cotangents):
+    point, normal, *_ = blended
+    side = stage(viewer_side, rows[0], rows[1], w)
+    made = stage(turned, view, point, normal, side)
+
+    def before(made, depth, position, facing):
+        x, y, z = planes(position)
+        _, pull = jax.vjp(lambda *n: scaled(n, scales(n)), *planes(made)[3:])
+        return jnp.stack([x, y, z - depth[:, 0], *pull(planes(facing))], 1)
+
+    def turned_back(view, g, first):
+        return jnp.stack([sum(view[k, c] * g[:, first + k] for k in range(3)) for c in range(3)], 1)
+
+    def view_sums(g, point, normal, side):
+        position, facing = planes(g)[:3], [t * side for t in planes(g)[3:]]
+        turn = [position[k] * point[:, c] + facing[k] * normal[:, c] for k in range(3) for c in range(3)]
+        sums = total_sums(turn + position)
+        return jnp.pad(jnp.concatenate([sums[:9].reshape(3, 3), sums[9:, None]], 1), ((0, 1), (0, 0)))
+
+    g = stage(before, made, *cotangents[:3])
+    g_point = stage(lambda view, g: turned_back(view, g, 0), view, g)
+    g_normal = stage(lambda view, g, side: turned_back(view, g, 3) * side[:, None], view, g, side)
+    return stage(view_sums, g, point, normal, side), None, [g_point, g_normal, *cotangents[3:]]
+
+
+def turned(view, point, normal, side):
+    """Position and normal in camera space, the latter turned to the viewer, [runs, 6, LANES]."""
+    position = [sum(view[k, c] * point[:, c] for c in range(3)) + view[k, 3] for k in range(3)]
+    return jnp.stack(position + [sum(view[k, c] * normal[:, c] for c in range(3)) * side for k in range(3)], 1)
+
+
+def viewer_side(position, normal, w):
     """-1 where the corner normals of a face look away from the side that is seen, else 1. One sign per face, so that
-    nothing flips inside of one; `inverse` is positive where the corners run counter-clockwise on screen."""
+    nothing flips inside of one; 1/s is positive where the corners run counter-clockwise on screen."""
     u = [position[:, 1, k] - position[:, 0, k] for k in range(3)]
     v = [position[:, 2, k] - position[:, 0, k] for k in range(3)]
     n = [normal[:, 0, k] + normal[:, 1, k] + normal[:, 2, k] for k in range(3)]
     out = sum(n[k] * (u[(k + 1) % 3] * v[(k + 2) % 3] - u[(k + 2) % 3] * v[(k + 1) % 3]) for k in range(3))
-    return jnp.where((out * jnp.sign(inverse)) < 0, -1, 1).astype(position.dtype)
+    return jnp.where((out * jnp.sign(w[:, 3])) < 0, -1, 1).astype(position.dtype)
 
 
-def unit(stage, n):
-    inverse = stage(inverse_length, n)
-    return [t * inverse for t in n]
+def scales(n):
+    """What x and y of the normal are to be multiplied with, and its z: unit, held at GRAZING, and unit again."""
+    x, y, z = n
+    first = inverse_length([x, y, z])
+    z = jnp.maximum(z * first, GRAZING)
+    second = inverse_length([x * first, y * first, z])
+    return first * second, z * second
+
+
+def scaled(n, scale):
+    return [n[0] * scale[0], n[1] * scale[0], scale[1]]
 
 
 def inverse_length(n):
@@ -111,3 +150,6 @@ def inverse_length(n):
     square = n[0] * n[0] + n[1] * n[1] + n[2] * n[2]
     there = square > jnp.finfo(square.dtype).tiny ** 0.5
     return jnp.where(there, lax.rsqrt(jnp.where(there, square, 1)), 0)
+
+
+SURFACE = Finish(surface, surface_reverse)

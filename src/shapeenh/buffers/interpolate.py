@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from shapeenh import checks
 from shapeenh.buffers.inputs import check_camera, check_mesh, check_table
 from shapeenh.buffers.project import clip_matrix
-from shapeenh.buffers.resolve import resolve
+from shapeenh.buffers.resolve import Finish, resolve
+from shapeenh.buffers.weights import planes
 from shapeenh.types import Camera, Mesh, Visibility
 
 
@@ -52,22 +53,34 @@ def check_seen(mesh, camera, visibility) -> None:
     check_camera(camera)
 
 
-def attributes(stage, view, b, blended, rows, inverse):
-    return [[blended[1][:, k] for k in range(blended[1].shape[1])]]
+def attributes(stage, write, view, w, blended, rows):
+    return [write(planes, blended[1])]
 
 
-def corner_weights(stage, view, b, blended, rows, inverse):
-    return [list(b)]
+def attributes_reverse(stage, view, w, blended, rows, cotangents):
+    return jnp.zeros_like(view), None, [None, cotangents[0]]
+
+
+def corner_weights(stage, write, view, w, blended, rows):
+    return [write(lambda w: planes(w)[:3], w)]
+
+
+def corner_weights_reverse(stage, view, w, blended, rows, cotangents):
+    return jnp.zeros_like(view), cotangents[0], [None]
+
+
+ATTRIBUTES = Finish(attributes, attributes_reverse)
+CORNER_WEIGHTS = Finish(corner_weights, corner_weights_reverse)
 
 
 @jax.jit
 def interpolated(attribute, vertices, view, projection, faces, triangle):
-    return resolved(attributes, attribute.shape[1], vertices, (attribute,), view, projection, faces, triangle)
+    return resolved(ATTRIBUTES, attribute.shape[1], vertices, (attribute,), view, projection, faces, triangle)
 
 
 @jax.jit
 def weights(vertices, view, projection, faces, triangle):
-    return resolved(corner_weights, 3, vertices, (), view, projection, faces, triangle)
+    return resolved(CORNER_WEIGHTS, 3, vertices, (), view, projection, faces, triangle)
 
 
 def resolved(finish, channels, vertices, tables, view, projection, faces, triangle):
