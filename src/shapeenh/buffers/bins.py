@@ -149,13 +149,17 @@ def corner_indices(faces, face):
 
 
 def ascending(index):
-    """The same corners [3, n] in ascending order, and whether that is a rotation of the face's own order.
+    """The same corners [3, n] in ascending order.
 
     A canonical order makes everything computed from it independent of how the face lists its corners: two copies of a
     face, one of them turned over, get the same depth to the bit, and the lowest index wins.
     """
     a, b, c = index
     low, high = jnp.minimum(a, b), jnp.maximum(a, b)
-    ordered = [jnp.minimum(low, c), jnp.maximum(low, jnp.minimum(high, c)), jnp.maximum(high, c)]
-    even = ((a < b) & (b < c)) | ((b < c) & (c < a)) | ((c < a) & (a < b))
-    return jnp.stack(ordered), even
+    return jnp.stack([jnp.minimum(low, c), jnp.maximum(low, jnp.minimum(high, c)), jnp.maximum(high, c)])
+
+
+def ascends(index):
+    """Whether the ascending order of corners [3, n] is a rotation of their own."""
+    a, b, c = index
+    return ((a < b) & (b < c)) | ((b < c) & (c < a)) | ((c < a) & (a < b))

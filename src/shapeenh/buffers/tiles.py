@@ -133,7 +133,7 @@ def nearness_range(xyr, near, shift):
 
 
 def draw_tiles(keys, vertices, face, index, xyr, even, valid, m, near, shift, *, height, width, cull, stride):
-    """Faces [n] with corner indices [3, n] (ascending) and corners xyr [3, 3, n], drawn into the keys."""
+    """Faces [n] with corner indices [3, n] (ascending) and corners xyr, three [3, n], drawn into the keys."""
     always = unknown_truth(vertices, m, face)
     m, wide_near, wide_shift = cast(m, F64), cast(near, F64), cast(shift, F64)
 

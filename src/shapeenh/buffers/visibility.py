@@ -15,10 +15,10 @@ import numpy as np
 from jax import lax
 
 from shapeenh import checks
-from shapeenh.buffers.bins import LARGE, WINDOWS, ascending, bin_faces, corner_indices, list_faces
+from shapeenh.buffers.bins import LARGE, WINDOWS, ascending, ascends, bin_faces, corner_indices, list_faces
 from shapeenh.buffers.inputs import check_camera, check_mesh
 from shapeenh.buffers.project import SUB, clip_matrix, nearness, nearness_shift, project
-from shapeenh.buffers.tiles import FACES, PAIRS, TILE, draw_tiles, tile_count
+from shapeenh.buffers.tiles import FACES, TILE, draw_tiles, tile_count
 from shapeenh.buffers.windows import (
     WINDOW,
     edge_functions,
@@ -30,13 +30,15 @@ from shapeenh.buffers.windows import (
     window_box,
     window_keys,
 )
-from shapeenh.buffers.xla import lower_bound, take
+from shapeenh.buffers.xla import take
 from shapeenh.fusion import stored, unknown_truth
 from shapeenh.types import Camera, Mesh, Visibility
 
 CHUNK = 8192  # faces per step
 SLOTS = 65536  # candidate pixels per step
+PAIRS = 2048  # (face, window) pairs per step: small kernels run on one core, so few of them
 BORDER = max(TILE, WINDOW, *(k for window in WINDOWS for k in window))  # windows may hang over the right and lower edge
+NO_PAIR = np.int32(2**31 - 1)
 CULL = {False: "none", None: "none", "none": "none", True: "back", "back": "back", "front": "front"}
 
 
@@ -120,13 +122,13 @@ def draw(vertices, faces, m, near, height, width, cull, cells, side):
             rank = first_rank + lax.iota(jnp.int32, chunk)
             total = totals[row]
 
-            def fetch(face):
-                index, even = ascending(corner_indices(flat_faces, face))
-                plane = np.arange(3, dtype=np.int32)[:, None, None] * vertices.shape[0]
-                return take(flat_corners, index[None] + plane), index, even
+            def fetch(index, plane):
+                return take(flat_corners, index.reshape(-1) + np.int32(plane * vertices.shape[0]))
 
             face = lax.dynamic_slice_in_dim(listed, begins[row] + first_rank, chunk)
-            xyr, index, even = stored(always, fetch, face)
+            own = stored(always, corner_indices, flat_faces, face)
+            index = stored(always, ascending, own)
+            xyr = [stored(always, functools.partial(fetch, plane=k), index).reshape(index.shape) for k in range(3)]
             there = jnp.minimum(total - first_rank, chunk)
             # one loop per class, of which all but one take no step: unlike a conditional, a loop updates in place
             sizes = [jnp.where(row == k, there, 0) for k in range(LARGE)]
@@ -135,10 +137,9 @@ def draw(vertices, faces, m, near, height, width, cull, cells, side):
             part = max(1, min(chunk // 2, FACES, (2**31 - 1) // tile_count(height, width)))  # so that counts fit int32
 
             def draw_large(j, keys):
-                f, i, c, e, v = cut(j * part, part, face, index, xyr, even, rank < total)
-                return draw_tiles(
-                    keys, vertices, f, i, c, e, v, m, near, shift, height=height, width=width, cull=cull, stride=stride
-                )
+                some, order, corner, valid, *at = cut(j * part, part, face, own, index, rank < total, *xyr)
+                image = {"height": height, "width": width, "cull": cull, "stride": stride}
+                return draw_tiles(keys, vertices, some, corner, at, ascends(order), valid, m, near, shift, **image)
 
             keys = lax.fori_loop(jnp.int32(0), (sizes[-1] + (part - 1)) // part, draw_large, keys)
             return i + 1, keys
@@ -166,17 +167,18 @@ def draw_windows(always, keys, face, xyr, valid, shift, sizes, height, width):
         return planes, jnp.stack([y0 * stride + x0, columns, rows])
 
     planes, box = stored(always, setup, xyr, valid)
-    low = ~face.astype(jnp.uint32)
+    low, first = ~face.astype(jnp.uint32), box[0]
     for (rows, columns), size in zip(WINDOWS, sizes[:-1], strict=True):
-        part = min(face.shape[0] // 2, SLOTS // (rows * columns))
+        part = min(face.shape[0], SLOTS // (rows * columns))
+        make_keys, put = (pixel_keys, merge_pixels) if rows * columns <= 4 else (window_keys, merge)
 
-        def draw_part(j, keys, rows=rows, columns=columns, part=part):
-            both, name, start = stored(always, lambda *t: cut(j * part, part, *t), planes, low, box[0])
-            edges, plane = both[:9].reshape(3, 3, -1), both[9:]
-            if rows * columns > 4:
-                return merge(keys, window_keys(edges, plane, name, rows, columns), start, stride)
-            new = stored(always, lambda e, p, name: pixel_keys(e, p, name, rows, columns), edges, plane, name)
-            return merge_pixels(keys, new, start, stride, columns)
+        def draw_part(j, keys, rows=rows, columns=columns, part=part, make_keys=make_keys, put=put):
+            some, name, start = stored(always, lambda *t: cut(j * part, part, *t), planes, low, first)
+
+            def new_keys(planes, low):
+                return make_keys(planes[:9].reshape(3, 3, -1), planes[9:], low, rows, columns)
+
+            return put(keys, stored(always, new_keys, some, name), start, stride)
 
         keys = lax.fori_loop(jnp.int32(0), (size + (part - 1)) // part, draw_part, keys)
     return draw_medium(always, keys, planes, low, box, sizes[-1], stride)
@@ -188,22 +190,27 @@ def draw_medium(always, keys, planes, low, box, size, stride):
 
     def listed(box):
         windows = jnp.where(lax.iota(jnp.int32, n) < size, box[1] * box[2], 0)
-        return windows, jnp.cumsum(windows, dtype=jnp.int32)
+        ends = jnp.cumsum(windows, dtype=jnp.int32)
+        begins = jnp.where(windows > 0, ends - windows, NO_PAIR)
+        return ends, jnp.append(begins, jnp.full((PAIRS,), NO_PAIR))
 
-    windows, ends = stored(size > 0, listed, box)  # of chunks of other classes, nothing
+    ends, begins = stored(size > 0, listed, box)  # of chunks of other classes, nothing
     total = ends[-1]
     flat, row_start = planes.reshape(-1), np.arange(planes.shape[0], dtype=np.int32)[:, None] * n
 
     def step(j, keys):
-        def find(ends, windows, box):
+        def find(ends, begins, box):
+            """The pairs' faces, by counting the faces that begin among them, and their windows' column and row."""
             pair = j * PAIRS + lax.iota(jnp.int32, PAIRS)
-            last = jnp.minimum(pair, total - 1)
-            at = lower_bound(ends, last)
-            number = last - (take(ends, at) - take(windows, at))
+            earliest = jnp.sum(ends <= j * PAIRS, dtype=jnp.int32)  # the face of the first pair
+            later = lax.dynamic_slice(begins, (earliest + 1,), (PAIRS - 1,)) - j * PAIRS
+            marks = jnp.zeros((PAIRS + 1,), jnp.int32).at[jnp.minimum(later, PAIRS)].set(1, mode="promise_in_bounds")
+            at = earliest + jnp.cumsum(marks[:PAIRS], dtype=jnp.int32)
+            number = jnp.minimum(pair, total - 1) - take(begins, at)
             row = number // take(box[1], at)
             return at, number - row * take(box[1], at), row, pair < total
 
-        at, column, row, there = stored(always, find, ends, windows, box)
+        at, column, row, there = stored(always, find, ends, begins, box)
         local = stored(always, lambda at, flat: take(flat, at[None] + row_start), at, flat)
 
         def moved(local, column, row, there):

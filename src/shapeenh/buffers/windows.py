@@ -101,7 +101,7 @@ def merge(keys, new, first, stride):
 
 
 def pixel_keys(edges, plane, low, rows, columns):
-    """The same keys as a list of [n], for a window too narrow to be worth a SIMD lane per pixel: a lane per face
+    """The same keys as [rows, columns, n], for a window too narrow to be worth a SIMD lane per pixel: a lane per face
     instead."""
     a, b, c = edges
     keys = []
@@ -111,12 +111,11 @@ def pixel_keys(edges, plane, low, rows, columns):
             inside = three(jnp.minimum, [a[k] * dx + b[k] * dy + c[k] for k in range(3)]) >= 0
             r = plane[0] + plane[1] * np.float32(column) + plane[2] * np.float32(row)
             keys.append(pack(inside, jnp.maximum(jnp.minimum(r, plane[4]), plane[3]), low))
-    return keys
+    return jnp.stack(keys).reshape(rows, columns, -1)
 
 
-def merge_pixels(keys, new, first, stride, columns):
-    """keys [n] with the pixels `new` of windows whose first pixel is `first`."""
-    for k, key in enumerate(new):
-        at = first + (k // columns * stride + k % columns)
-        keys = keys.at[at].max(key, mode="promise_in_bounds", wrap_negative_indices=False)
-    return keys
+def merge_pixels(keys, new, first, stride):
+    """keys [n] with the pixels `new` [rows, columns, m] of windows whose first pixel is `first` [m]."""
+    rows, columns, _ = new.shape
+    at = first[None, None] + np.add.outer(np.arange(rows) * stride, np.arange(columns)).astype(np.int32)[:, :, None]
+    return keys.at[at.reshape(-1)].max(new.reshape(-1), mode="promise_in_bounds", wrap_negative_indices=False)
