@@ -1,7 +1,7 @@
 """Other people's rasterisers and ray casters as calls of no arguments, for those that are installed.
 
-Every peer gets the same mesh and camera. What it answers: `ids` the nearest face per pixel, `G-buffer` position (or
-depth) and normal per pixel. Not timed: uploads, the BVH of the ray casters, and what `read_ids` does.
+Every peer gets the same mesh and camera. What it answers: `ids` the nearest face per pixel, `G-buffer` what the peer's
+docstring says. Not timed: uploads, the BVH of the ray casters, and what `read_ids` does.
 """
 
 from __future__ import annotations
@@ -39,7 +39,10 @@ def rays(camera, height: int, width: int):
 
 
 def llvmpipe(vertices, faces, normals, camera, height, width) -> dict:
-    """OpenGL through EGL; `finish` and no read-back, which favours it on a GPU and costs nothing in software."""
+    """OpenGL through EGL, into the framebuffer of the frame before, until `finish`; nothing is read back.
+
+    G-buffer: world position and window depth, unit normal and 1, id, and the depth buffer, 40 bytes per pixel.
+    """
     import moderngl
 
     context = moderngl.create_context(standalone=True, backend="egl")
@@ -82,7 +85,21 @@ def llvmpipe(vertices, faces, normals, camera, height, width) -> dict:
     return made
 
 
+def llvmpipe_read(vertices, faces, normals, camera, height, width) -> dict:
+    """The same G-buffer read into new arrays, as ours are new arrays at every call."""
+    draw = llvmpipe(vertices, faces, normals, camera, height, width)["G-buffer"]
+
+    def read():
+        target = draw()
+        kinds = [(4, "f4"), (4, "f4"), (1, "i4")]
+        data = (target.read(components=n, attachment=k, dtype=kind) for k, (n, kind) in enumerate(kinds))
+        return [np.frombuffer(d, kind).reshape(height, width, n) for d, (n, kind) in zip(data, kinds, strict=True)]
+
+    return {"G-buffer": read}
+
+
 def mitsuba(vertices, faces, normals, camera, height, width) -> dict:
+    """G-buffer: world position, shading normal and id in planes, 28 bytes per pixel, in memory that Dr.Jit keeps."""
     import drjit
     import mitsuba
 
@@ -142,7 +159,7 @@ def read_ids(answer, height: int, width: int):
     return np.asarray(answer).astype(np.int32).reshape(height, width)
 
 
-PEERS = {"llvmpipe": llvmpipe, "Mitsuba 3": mitsuba, "Open3D": open3d, "DEODR": deodr}
+PEERS = {"llvmpipe": llvmpipe, "llvmpipe read": llvmpipe_read, "Mitsuba 3": mitsuba, "Open3D": open3d, "DEODR": deodr}
 
 
 def prototype(folder: Path, mesh: se.Mesh, camera: se.Camera, height: int, width: int) -> dict:
