@@ -76,9 +76,16 @@ def gradients(found: dict) -> str:
     return f"{said}\n\n{markdown(head, rows)}"
 
 
+def pages(found: dict) -> str:
+    """A row per call."""
+    rows = [[r["call"], ms(r["ms"]), ms(r["ms with large pages"]), f"{r['ratio']:.2f}"] for r in found["rows"]]
+    return markdown(["call", "ms", "with large pages", "ratio"], rows)
+
+
 TABLES = {
     "frame": ("README.md", frame),
     "gradients": ("docs/gradients.md", gradients),
+    "pages": ("docs/skipping.md", pages),
     "precision": ("docs/precision.md", precision),
     "skipping": ("docs/skipping.md", skipping),
 }
