@@ -14,6 +14,8 @@ import numpy as np
 
 import shapeenh as se
 
+KEPT = "G-buffer, kept memory"  # into the memory of the frame before
+
 
 def calls(mesh: se.Mesh, camera: se.Camera, height: int, width: int) -> tuple[dict, dict]:
     """(row name -> call, peer -> why it is not here)."""
@@ -82,7 +84,7 @@ def llvmpipe(vertices, faces, normals, camera, height, width) -> dict:
 
         draw()
         made[row] = draw
-    return made
+    return made | {KEPT: made["G-buffer"]}
 
 
 def llvmpipe_read(vertices, faces, normals, camera, height, width) -> dict:

@@ -68,8 +68,9 @@ def forward(finish, position, tables, view, m, faces, ids):
     lane = jax.ShapeDtypeStruct((1, 4, LANES), dtype)
     shapes = [jax.ShapeDtypeStruct((1, 3, k, LANES), dtype) for _, k in packed]
     counts = [len(field) for field in jax.eval_shape(functools.partial(finished, finish), view, lane, shapes)]
-    # run-time zeros, one each: equal constants would be one broadcast and a copy per field
-    zeros = [jnp.where(flat[0] < -2 - k, dtype.type(1), dtype.type(0)) for k in range(len(counts))]
+    # run-time zeros, one each: equal constants would be one broadcast and a copy per field. Not of the ids: what those
+    # were made of would be held until here, and could not lend its memory to the fields
+    zeros = [jnp.where(total < -1 - k, dtype.type(1), dtype.type(0)) for k in range(len(counts))]
     fields = [jnp.broadcast_to(zero, (size * count,)) for zero, count in zip(zeros, counts, strict=True)]
 
     def step(state):
