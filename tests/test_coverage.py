@@ -61,7 +61,7 @@ def sampled(mesh, camera, samples, **options):
 # ------------------------------------------------------------------------------------------- the fraction
 
 
-@pytest.mark.parametrize("samples", [2, 4])
+@pytest.mark.parametrize("samples", [pytest.param(2, marks=pytest.mark.thorough), 4])
 def test_the_fraction_is_the_number_of_covered_samples(rng, samples):
     mesh, camera = ball(), se.perspective_camera((1, 2, 3), (0.1, 0, 0), fov_degrees=30, aspect=W / H)
     g, coverage, _, blocks = sampled(mesh, camera, samples)
@@ -171,7 +171,7 @@ def twin_scene(name, rng, dtype):
     return normals_of(make(vertices, faces, dtype)), cast(camera, dtype)
 
 
-@pytest.mark.parametrize("name", ["ball", "parallel", "perspective"])
+@pytest.mark.parametrize("name", [pytest.param("ball", marks=pytest.mark.thorough), "parallel", "perspective"])
 def test_against_the_twin(x64, rng, name):
     mesh, camera = twin_scene(name, rng, x64)
     g, coverage, fine, blocks = sampled(mesh, camera, 2)

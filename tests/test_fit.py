@@ -637,7 +637,9 @@ def hidden_picture(dtype):
     return shaded({name: jnp.asarray(value, dtype) for name, value in HIDDEN.items()})
 
 
-@pytest.mark.parametrize("solver", ["scipy", "adam", *SLOW_TO_COMPILE])
+@pytest.mark.parametrize(
+    "solver", ["scipy", "adam", pytest.param("lbfgsb", marks=pytest.mark.thorough), SLOW_TO_COMPILE[1]]
+)
 def test_hidden_parameters_are_recovered_from_their_picture(solver, dtype):
     start = {"alpha": jnp.asarray(5.0, dtype), "gamma": jnp.asarray(-0.2, dtype)}
     found = se.fit_image(shaded, hidden_picture(dtype), start, mask=MASK, bounds=BOUNDS, solver=solver)

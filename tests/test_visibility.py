@@ -192,12 +192,14 @@ def test_against_brute_force(dtype, rng, name, cull):
     assert undecided.mean() < 0.1
 
 
-SLOW = pytest.mark.slow
-
-
 @pytest.mark.parametrize(
     ("height", "width"),
-    [(1, 1), (3, 70), *(pytest.param(*s, marks=SLOW) for s in [(7, 5), (1, 2), (70, 1), (9, 9), (65, 63), (257, 3)])],
+    [
+        (1, 1),
+        (3, 70),
+        *(pytest.param(*size, marks=pytest.mark.slow) for size in [(70, 1), (65, 63), (257, 3)]),
+        *(pytest.param(*size, marks=pytest.mark.thorough) for size in [(7, 5), (1, 2), (9, 9)]),
+    ],
 )
 def test_every_image_size(rng, height, width):
     vertices, faces = soup(rng, 30, 0.5)
