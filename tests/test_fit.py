@@ -638,7 +638,13 @@ def hidden_picture(dtype):
 
 
 @pytest.mark.parametrize(
-    "solver", ["scipy", "adam", pytest.param("lbfgsb", marks=pytest.mark.thorough), SLOW_TO_COMPILE[1]]
+    "solver",
+    [
+        "scipy",
+        "adam",
+        pytest.param("projected", marks=pytest.mark.slow),
+        pytest.param("lbfgsb", marks=pytest.mark.thorough),
+    ],
 )
 def test_hidden_parameters_are_recovered_from_their_picture(solver, dtype):
     start = {"alpha": jnp.asarray(5.0, dtype), "gamma": jnp.asarray(-0.2, dtype)}

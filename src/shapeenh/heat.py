@@ -20,6 +20,8 @@ from jax.custom_derivatives import SymbolicZero
 from shapeenh.fusion import stored
 
 STEP = 0.2  # at 1/4 a checkerboard would keep its amplitude (SPEC 3.5)
+REPLAYED = 4  # steps between the finest kept states: to take them again costs less than to store and load more states
+SLOTS = 10  # states that the reverse sweep keeps at most per level
 
 # ------------------------------------------------------------------------------------------- the operator
 
@@ -64,7 +66,7 @@ def _forward(start, stop, g, fixed, step):
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(5, 6))
-def explicit(planes, link_x, link_y, budget, weight, step=STEP, slots=(10, 10, 10, 10)):
+def explicit(planes, link_x, link_y, budget, weight, step=STEP, slots=(SLOTS,) * 4):
     """`planes` after each pixel has spent its time `budget` in explicit steps (SPEC 3.5, 3.6).
 
     planes: [C, H, W]; link_x: [H, W-1]; link_y: [H-1, W]; budget: [1, 1] or [H, W], time in px^2, sigma = sqrt(2 time).
@@ -84,8 +86,6 @@ def explicit(planes, link_x, link_y, budget, weight, step=STEP, slots=(10, 10, 1
 # The derivative with respect to a pixel's budget is lam w (A g) at its last, short step: that one A g per pixel is kept
 # on the way forward. The derivative with respect to a link is -jump(dt w lam) jump(g) summed over all steps: only where
 # it is asked for is g computed again: kept at some steps, and for the few up to the next taken anew each time.
-
-REPLAYED = 4  # steps between the finest kept states: to take them again costs less than to store and load more states
 
 
 def _explicit_fwd(planes, link_x, link_y, budget, weight, step, slots):
@@ -230,10 +230,15 @@ def _reverse(start, count, g, carry, fixed, rate, step, slots):
 explicit.defvjp(_explicit_fwd, _explicit_bwd, symbolic_zeros=True)
 
 
-def slots_for(steps: float, most: int = 10) -> tuple[int, ...]:
-    """`slots` of `explicit` for up to `steps` steps, none above `most`."""
-    stretches = math.ceil(steps / REPLAYED - 1e-6)
+def depth_for(steps: float, most: int = SLOTS) -> int:
+    """How many levels of `most` states do for so many steps."""
     depth = 0
-    while most**depth < stretches:
+    while REPLAYED * most**depth < steps:
         depth += 1
-    return (max(2, math.ceil(stretches ** (1 / max(depth, 1)))),) * depth
+    return depth
+
+
+def slots_for(steps: int, most: int = SLOTS) -> tuple[int, ...]:
+    """`slots` of `explicit` for up to `steps` steps, none above `most`."""
+    depth = depth_for(steps, most)
+    return (max(2, math.ceil((steps / REPLAYED) ** (1 / max(depth, 1)) - 1e-6)),) * depth

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from shapeenh.fusion import stored
-from shapeenh.heat import STEP, explicit, slots_for
+from shapeenh.heat import SLOTS, STEP, explicit, slots_for
 from shapeenh.stencils import shift
 
 GREATEST_SIGMA = 100.0
@@ -180,7 +180,7 @@ def _descend(stacks, level: int, time, cells, always, levels: int, sure: bool):
         link_x, link_y, weight = stored(always, lambda *planes: planes, link_x, link_y, weight)
 
     def smooth(stacks, time, steps):
-        slots = slots_for(steps, 10 * 4**level)  # coarse states are small
+        slots = slots_for(steps, SLOTS * 4**level)  # coarse states are small
         return tuple(explicit(planes, link_x, link_y, time, weight, step, slots) for planes in stacks)
 
     few = 2 * _SMOOTHING[min(level, 1)] + 2 + _WORTH  # not worth a descent
@@ -226,11 +226,12 @@ def diffuse_stacks(stacks, link_x, link_y, budget, alive, always, *, levels: int
     stacks: each [C, H, W]; link_x, link_y, budget: as in `explicit`; alive: [H, W] bool, conductance > 0.
     always: a true predicate unknown at compile time, for `stored`.
     *Static*: levels: the fast scheme, for a budget of [1, 1], that merges blocks at most so often (`levels_for(sigma)`
-        or more; exactly that many if `sure`); or -n, explicit steps, at most 4 * 10^n where they are differentiated.
+        or more; exactly that many if `sure`); or -n, explicit steps, whose
+        reverse mode keeps n levels of states (`heat.depth_for`).
     """
     if levels < 0:
         one = jnp.ones((1, 1), link_x.dtype)
-        return tuple(explicit(planes, link_x, link_y, budget, one, STEP, (10,) * -levels) for planes in stacks)
+        return tuple(explicit(planes, link_x, link_y, budget, one, STEP, (SLOTS,) * -levels) for planes in stacks)
     border_x, border_y = jnp.pad(link_x, ((0, 0), (0, 1))), jnp.pad(link_y, ((0, 1), (0, 0)))
     return _descend(stacks, 0, budget, (alive.astype(link_x.dtype), border_x, border_y), always, levels, sure)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 
 import jax
@@ -13,7 +12,7 @@ from shapeenh.checks import check_choice, check_range, check_shape, check_type, 
 from shapeenh.descriptor import diffusion, edges, gradient
 from shapeenh.descriptor.box import covering_part, crop, paste
 from shapeenh.fusion import stored, unknown_truth
-from shapeenh.heat import STEP
+from shapeenh.heat import STEP, depth_for
 from shapeenh.numerics import determinant, eigenvalues, safe_divide, safe_hypot
 from shapeenh.stencils import derivatives, links
 from shapeenh.types import Descriptor, GBuffer, replace
@@ -155,7 +154,7 @@ def _smoothing(sigma, importance, scheme: str) -> tuple[int, bool, bool]:
         if known and importance is not None:
             most = float(np.max(importance, initial=0))
             steps = min(steps, most) if steps > 0 else most
-        return -max(1, math.ceil(math.log10(max(steps, 1) / 4) + 1e-6)), True, chart
+        return -max(1, depth_for(1.00001 * steps)), True, chart  # rounding may make it one step more
     return diffusion.levels_for(float(sigma) if known else diffusion.GREATEST_SIGMA), known, chart
 
 
