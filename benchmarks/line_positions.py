@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial import KDTree
-from tests.reference.lines import line_points, step_points
+from tests.reference.lines import distance_to_borders, line_points, step_borders
 
 import shapeenh as se
 from benchmarks import harness
@@ -41,8 +41,8 @@ def occluding(gbuffer, descriptor, camera) -> dict:
     field = se.line_field("occlusion", gbuffer, descriptor)
     profile = se.fit_profile(field, radius=1.5, least=float(se.style_brush("ink", "occlusion").low))
     points = line_points(profile, field)
-    off = KDTree(step_points(gbuffer, camera, 1.0)).query(points)[0]
-    missed = KDTree(points).query(step_points(gbuffer, camera, 5.0))[0]
+    off = distance_to_borders(points, step_borders(gbuffer, camera, 1.0))
+    missed = KDTree(points).query(step_borders(gbuffer, camera, 5.0).mean(axis=1))[0]
     return {
         "occlusion px": len(points),
         "within 0.5 px": float(np.mean(off <= 0.5)),

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from scipy.spatial import KDTree
 
 # ------------------------------------------------------------------------------------------- profiles
 
@@ -122,8 +123,8 @@ def direction_singularity(direction, mask):
     return out
 
 
-def step_points(gbuffer, camera, least: float) -> np.ndarray:
-    """[n, 2] (row, column), four to a pixel, along the borders between pixels where the surface is torn: either of two
+def step_borders(gbuffer, camera, least: float) -> np.ndarray:
+    """[n, 2, 2]: (row, column) of both ends of the borders between pixels where the surface is torn: either of two
     neighbours lies more than `least` px of depth off the other one's tangent plane, or one is background."""
     mask, position, normal = (np.asarray(a) for a in (gbuffer.mask, gbuffer.position, gbuffer.normal))
     perspective = np.where(mask, np.asarray(gbuffer.depth), 1)
@@ -135,11 +136,19 @@ def step_points(gbuffer, camera, least: float) -> np.ndarray:
         across = at(position, b) - at(position, a)
         off = np.maximum(*(np.abs(np.sum(across * at(normal, i), -1)) for i in (a, b)))
         torn = (off > least * np.minimum(at(pixel, a), at(pixel, b))) & at(mask, a) & at(mask, b)
-        rows, columns = np.nonzero(torn | (at(mask, a) != at(mask, b)))
-        for along in (-0.375, -0.125, 0.125, 0.375):
-            spots = (rows + 0.5, columns + along) if axis == 0 else (rows + along, columns + 0.5)
-            found.append(np.stack(spots, -1))
+        first = np.argwhere(torn | (at(mask, a) != at(mask, b)))
+        ends = ([0.5, -0.5], [0.5, 0.5]) if axis == 0 else ([-0.5, 0.5], [0.5, 0.5])
+        found.append(first[:, None] + np.asarray(ends))
     return np.concatenate(found)
+
+
+def distance_to_borders(points, borders) -> np.ndarray:
+    """[n], px, from points [n, 2] to the nearest of the borders [m, 2, 2]."""
+    start, along = borders[:, 0], borders[:, 1] - borders[:, 0]
+    near = KDTree(borders.mean(axis=1)).query(points, k=min(24, len(borders)))[1].reshape(len(points), -1)
+    apart = points[:, None] - start[near]
+    share = np.clip(np.sum(apart * along[near], -1), 0, 1)  # borders are 1 px long
+    return np.linalg.norm(apart - share[..., None] * along[near], axis=-1).min(axis=1)
 
 
 def line_points(profile, field) -> np.ndarray:

@@ -9,17 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from shapeenh.checks import check_choice, check_range, check_shape, check_type, float_dtype, is_concrete
+from shapeenh.checks import check_choice, check_range, check_shape, check_type, float_dtype
 from shapeenh.fusion import stored, unknown_truth
+from shapeenh.lines.depth_steps import SURE, depth_steps, surface_of
 from shapeenh.lines.smoothing import LEAST_HEIGHT, prepare, smoothed_field
-from shapeenh.lines.tiles import list_tiles, over_tiles
 from shapeenh.numerics import safe_divide, safe_hypot, smoothstep
 from shapeenh.stencils import derivatives, links, shift
 from shapeenh.types import Descriptor, GBuffer, LineField
 
 KINDS = ("occlusion", "surface", "luminance", "ridge", "valley", "inflection")
 GREATEST_SIGMA = 20.0
-_STEP_SIGMA = 0.75  # px
+_STEP_SIGMA = 0.65  # px; with more, one line runs between two steps that are 3 px apart
 
 # ------------------------------------------------------------------------------------------- public
 
@@ -45,7 +45,7 @@ def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=None) ->
         luminance: [H, W], for kind "luminance" and no other.
         sigma: [], px, in [0, 20]: heights and directions are diffused this far, insulated by silhouettes. None: 1, and
             0 for occlusion. (Occlusion lines live *on* the silhouettes: they are diffused freely, background included,
-            and by 0.75 px more, since a step is thinner than any profile. Fit them with a radius of 1.5: steps less
+            and by 0.65 px more, since a step is thinner than any profile. Fit them with a radius of 1.5: steps less
             than 2 px apart become one line between them, with larger radii and sigma sooner.)
 
     Static: kind.
@@ -76,7 +76,8 @@ def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=None) ->
         h, w = np.shape(gbuffer.mask)
         for name, tail in (("hessian", (3,)), ("gradient", (2,)), ("silhouette", ())):
             check_shape(f"descriptor.{name}", getattr(descriptor, name), (h, w, *tail))
-        check_shape("gbuffer.depth", gbuffer.depth, (h, w))
+        for name, tail in (("depth", ()), ("normal", (3,)), ("position", (3,))):
+            check_shape(f"gbuffer.{name}", getattr(gbuffer, name), (h, w, *tail))
         if luminance is not None:
             check_shape("luminance", luminance, (h, w))
         dtype = float_dtype(descriptor.hessian)
@@ -219,9 +220,9 @@ def _gradient(descriptor, luminance, good, silhouette, kind, always):
 def _occlusion(gbuffer, silhouette):
     """|g_d| and its direction, with every step of depth normalised to 1 and slopes taken off."""
     planes = []
-    for axis, step in enumerate(_depth_steps(gbuffer.mask, gbuffer.depth, silhouette)):
+    for axis, step in enumerate(depth_steps(surface_of(gbuffer), silhouette)):
         # half marked at a pixel or two is the fold of a coarse mesh, not an edge
-        step = jnp.sign(step) * smoothstep(0.25, 0.75, jnp.abs(step))
+        step = jnp.sign(step) * smoothstep(*SURE, jnp.abs(step))
         before, after = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
         before[axis], after[axis] = (1, 0), (0, 1)
         half = 0.5 * (jnp.pad(step, before) + jnp.pad(step, after))
@@ -229,76 +230,3 @@ def _occlusion(gbuffer, silhouette):
         planes.append(0.5 * half + 0.25 * (shift(half, 1, other) + shift(half, -1, other)))  # Sobel
     g_x, g_y = planes[1], -planes[0]
     return safe_hypot(g_x, g_y), _doubled(g_x, g_y)
-
-
-def _depth_steps(mask, depth, silhouette):
-    """[down the columns [H-1, W], along the rows [H, W-1]]: the step between neighbours, in [-1, 1], positive where the
-    second one is farther.
-
-    The descriptor marks the far side of a step with a weight; which of its neighbours it is far *of* is read off the
-    depth. Off the mask everything is far.
-    """
-    depth = jnp.where(mask & jnp.isfinite(depth), depth, 0)
-
-    def pair(image, axis):
-        return tuple(lax.slice_in_dim(image, i, mask.shape[axis] - 1 + i, axis=axis) for i in (0, 1))
-
-    def steps(axis):
-        (on_a, on_b), (a, b), (w_a, w_b) = pair(mask, axis), pair(depth, axis), pair(silhouette, axis)
-        jump = jnp.where(on_a & on_b, b - a, 0)
-        sign = jnp.sign(jump)
-        # the step that a steep but smooth surface would show anyway: that of the next pair along the line
-        expected = jnp.maximum(jnp.maximum(sign * shift(jump, 1, axis), sign * shift(jump, -1, axis)), 0)
-        excess = jnp.maximum(jnp.abs(jump) - expected, 0)
-        return on_a, on_b, sign, excess, jnp.where(sign > 0, w_b, w_a)
-
-    def padded(plane, axis):
-        """Per pixel, the larger of the values on both of its pairs along an axis."""
-        before, after = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
-        before[axis], after[axis] = (1, 0), (0, 1)
-        return jnp.maximum(jnp.pad(plane, before), jnp.pad(plane, after))
-
-    pairs = [steps(axis) for axis in (0, 1)]
-    largest = jnp.maximum(*(padded(p[3], axis) for axis, p in enumerate(pairs)))
-    found = []
-    for axis, (on_a, on_b, sign, excess, weight) in enumerate(pairs):
-        top_a, top_b = pair(largest, axis)
-        share = safe_divide(excess, jnp.where(sign > 0, top_b, top_a))
-        inner = sign * weight * smoothstep(0.3, 0.6, share)
-        outer = on_a.astype(inner.dtype) - on_b.astype(inner.dtype)  # +1 where the second one is background
-        found.append(jnp.where(on_a & on_b, inner, outer))
-    return found
-
-
-def depth_barriers(gbuffer, descriptor, *, near=None, around: int = 0):
-    """(across, down), [H, W] bool: whether between a pixel and the one to its right, or below, there is a step of depth
-    or the outline. No gradient.
-
-    near: [H, W] bool; only up to `around` pixels from where it is set need the answer be right. None: everywhere.
-    """
-    surface = gbuffer.mask, gbuffer.depth, descriptor.silhouette
-    if is_concrete(surface, near):
-        tiles = list_tiles(near, _MARGIN, around=around)
-        if tiles is not None:
-            return _tiled_barriers(surface, tiles)
-    return _barriers(surface)
-
-
-_MARGIN = 8
-
-
-@jax.jit
-def _tiled_barriers(surface, tiles):
-    always = unknown_truth(surface[1])
-
-    def barriers(surface):  # what is cut out is stored, or every neighbour that the stencils read is cut out again
-        return _barriers(stored(always, lambda surface: surface, surface))
-
-    return over_tiles(barriers, surface, tiles, (False, False), margin=_MARGIN)
-
-
-@jax.jit
-def _barriers(surface):
-    mask, depth, silhouette = surface
-    down, across = _depth_steps(mask, depth, jnp.where(mask & jnp.isfinite(silhouette), silhouette, 0))
-    return jnp.pad(jnp.abs(across) > 0.5, ((0, 0), (0, 1))), jnp.pad(jnp.abs(down) > 0.5, ((0, 1), (0, 0)))
