@@ -1,6 +1,7 @@
 """Strict JAX for every test: x64 is switched on per test by the `x64` fixture; rank promotion is an error."""
 
 import os
+import tempfile
 from pathlib import Path
 
 import jax
@@ -8,6 +9,20 @@ import numpy as np
 import pytest
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def pytest_configure(config):
+    """What one file or worker compiles, the others of this run load. Workers find the folder in their environment."""
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    folder = tempfile.TemporaryDirectory(prefix="shapeenh-programs-")
+    config.add_cleanup(folder.cleanup)
+    for name, value in (
+        ("jax_compilation_cache_dir", folder.name),
+        ("jax_persistent_cache_min_compile_time_secs", 0.1),
+    ):
+        os.environ[name.upper()] = str(value)
+        jax.config.update(name, value)
 
 
 def pytest_addoption(parser):
@@ -39,7 +54,7 @@ def x64():
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_programs():
-    """Compiled programs of one file are of little use to the next, and a run of all would hold gigabytes of them."""
+    """A run of all files would hold gigabytes of compiled programs; the next file loads what it needs of them again."""
     yield
     if _resident_bytes() > 2 << 30:
         jax.clear_caches()

@@ -10,11 +10,7 @@ import shapeenh as se
 from shapeenh.cli import main
 
 SMALL = ["--size", "48x36", "--lights", "8"]
-
-
-@pytest.fixture(autouse=True)
-def no_compilation_cache(monkeypatch, tmp_path):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+COARSE = ["--size", "64x48", "--lights", "8", "--samples", "1"]  # as in other files, which share what it compiles
 
 
 @pytest.fixture
@@ -82,7 +78,8 @@ def test_only_buffers_and_json(mesh_file, tmp_path, capsys):
 
 def test_a_terminal_is_told_what_goes_on_and_what_compiling_took(mesh_file, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
-    assert main(["render", str(mesh_file), "-o", str(tmp_path / "o.png"), "--size", "50x34", "--lights", "8"]) == 0
+    new = ["--size", "50x34", "--lights", "8", "--samples", "1"]  # what no other test has compiled
+    assert main(["render", str(mesh_file), "-o", str(tmp_path / "o.png"), *new]) == 0
     said = capsys.readouterr().err
     assert "shapeenh: G-buffer ...\n" in said
     took = re.search(r"shapeenh: G-buffer: ([\d.]+) s, of which ([\d.]+) s compiling", said)
@@ -90,16 +87,15 @@ def test_a_terminal_is_told_what_goes_on_and_what_compiling_took(mesh_file, tmp_
 
 
 def test_the_embedded_object_needs_no_file(tmp_path):
-    assert (
-        main(["render", "-o", str(tmp_path / "o.png"), "--only", "--env", "sky", "--material", "bronze", *SMALL]) == 0
-    )
+    options = ["--only", "--env", "sky", "--material", "bronze", *COARSE]
+    assert main(["render", "-o", str(tmp_path / "o.png"), *options]) == 0
     assert se.load_image(tmp_path / "o.png").std() > 10
 
 
 def test_a_mesh_with_nan_goes_on_with_a_warning(tmp_path, capsys):
     path = tmp_path / "nan.obj"
     path.write_text("v 0 0 nan\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 2 3 4\n")
-    assert main(["render", str(path), "-o", str(tmp_path / "o.png"), *SMALL]) == 0
+    assert main(["render", str(path), "-o", str(tmp_path / "o.png"), *COARSE]) == 0
     assert capsys.readouterr().err.count("shapeenh: warning: ") == 1
 
 

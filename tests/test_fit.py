@@ -730,8 +730,7 @@ def test_importing_the_package_loads_no_solver_and_warns_of_nothing():
 # ------------------------------------------------------------------------------------------- command line
 
 
-def test_shapeenh_fit_finds_draws_and_prints(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+def test_shapeenh_fit_finds_draws_and_prints(tmp_path, capsys):
     small = ["--size", "64x48", "--lights", "8", "--samples", "1", "-o", str(tmp_path / "o.png")]
     assert main(["fit", "--target-contrast", "0.82", "--fit", "gamma", "--json", *small]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -776,8 +775,7 @@ def test_shapeenh_fit_says_why_it_did_not_converge(capsys):
         ([], "--target-contrast"),
     ],
 )
-def test_shapeenh_fit_names_bad_input(options, words, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+def test_shapeenh_fit_names_bad_input(options, words, tmp_path, capsys):
     small = ["--size", "64x48", "--lights", "8", "--samples", "1", "-o", str(tmp_path / "o.png")]
     assert main(["fit", *options, *small]) == 2
     assert words in capsys.readouterr().err

@@ -14,11 +14,6 @@ H, W = 24, 32
 LINES = ["--kinds", "luminance", "--detail", "10"]
 
 
-@pytest.fixture(autouse=True)
-def no_compilation_cache(monkeypatch):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
-
-
 def moving_edge(k):
     """A bright half plane whose border moves one pixel per frame."""
     x = np.arange(W) - (8.0 + k)
@@ -96,7 +91,6 @@ def test_a_frame_interrupted_while_it_is_written_leaves_nothing(place, clip, tmp
     assert main(arguments) == 130
     assert sorted(p.name for p in out.iterdir()) == [frames.RECORD, "f0.png"]
     monkeypatch.undo()
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
     (out / f".f1.png{frames.PARTIAL}").write_bytes(b"killed without a chance to clean up")
     assert main(arguments) == 0
     assert sorted(p.name for p in out.iterdir()) == [frames.RECORD, "f0.png", "f1.png"]

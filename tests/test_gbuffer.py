@@ -7,13 +7,13 @@ import trimesh
 
 from shapeenh import Mesh, interpolate, orthographic_camera, perspective_camera, rasterize, render_gbuffer
 from shapeenh.types import replace
-from tests.test_visibility import H, W, cast
+from tests.test_visibility import H, W, cast, make
 
 
-def ball(dtype=np.float32, subdivisions=3):
-    solid = trimesh.creation.icosphere(subdivisions=subdivisions)
-    vertices = jnp.asarray(solid.vertices, dtype)
-    return Mesh(vertices, jnp.asarray(solid.faces, jnp.int32), vertices)
+def ball(dtype=np.float32):
+    solid = trimesh.creation.icosphere(subdivisions=3)
+    mesh = make(solid.vertices, solid.faces, dtype)
+    return replace(mesh, normals=mesh.vertices)
 
 
 def camera_of(kind, dtype=np.float32):

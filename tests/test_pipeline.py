@@ -1,6 +1,7 @@
 """The whole chain: laws of the picture, recompilation."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -8,12 +9,19 @@ import numpy as np
 import pytest
 
 import shapeenh as se
+from tests.test_visibility import FACES, VERTICES, H, W
 
-SIZE = {"height": 48, "width": 64}
+SIZE = {"height": H, "width": W}
+
+
+def padded(mesh, dtype):
+    """As large as the meshes of `test_visibility`, so that all share the compiled rasteriser."""
+    mesh = se.pad_mesh(mesh, vertices=VERTICES, faces=FACES)
+    return jax.tree.map(lambda a: a.astype(dtype) if a.dtype.kind == "f" else a, mesh)
 
 
 def scene(dtype=np.float32, lights=12):
-    mesh = jax.tree.map(lambda a: a.astype(dtype) if a.dtype.kind == "f" else a, se.torus(segments=24))
+    mesh = padded(se.torus(segments=16), dtype)
     camera = se.frame_mesh(mesh, direction=(0.2, 0.9, 0.7), aspect=4 / 3)
     lamps = se.sample_environment(se.procedural_studio(), lights)
     material = se.named_material("stone")
@@ -25,28 +33,34 @@ def test_the_picture_has_light_where_the_mask_is_and_nowhere_else(dtype):
     mesh, camera, lights, material = scene(dtype)
     image = se.render(mesh, camera, lights, material, se.LightWarp(30.0), sigma=1.0, **SIZE)
     mask = np.asarray(se.render_gbuffer(mesh, camera, **SIZE).mask)
-    assert image.shape == (48, 64, 3)
+    assert image.shape == (H, W, 3)
     assert image.dtype == dtype
     assert np.all(np.isfinite(image))
     assert np.all(np.asarray(image)[~mask] == 0)
     assert np.all(np.asarray(image)[mask].max(axis=-1) > 0)
 
 
+@functools.cache
+def compiled():
+    """jit of (enhancement, sigma) -> picture of the scene in float64."""
+    mesh, camera, lights, material = scene(np.float64)
+    return jax.jit(lambda look, sigma: se.render(mesh, camera, lights, material, look, sigma=sigma, **SIZE))
+
+
 @pytest.mark.parametrize(
     "enhancement",
     [se.LightWarp(0.0, 0.0), pytest.param(se.RadianceScaling(0.4, 0.0, 0.0), marks=pytest.mark.thorough)],
 )
-def test_strength_zero_is_the_plain_picture(enhancement):
-    mesh, camera, lights, material = scene()
+def test_strength_zero_is_the_plain_picture(enhancement, x64):
+    mesh, camera, lights, material = scene(x64)
     plain = se.render(mesh, camera, lights, material, **SIZE)
     same = se.render(mesh, camera, lights, material, enhancement, sigma=1.0, **SIZE)
-    traced = jax.jit(lambda e: se.render(mesh, camera, lights, material, e, sigma=1.0, **SIZE))(enhancement)
     np.testing.assert_allclose(same, plain, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(traced, plain, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(compiled()(enhancement, 1.0), plain, rtol=1e-5, atol=1e-5)
 
 
 def test_flat_places_do_not_change(x64):
-    mesh = jax.tree.map(lambda a: a.astype(np.float64) if a.dtype.kind == "f" else a, se.plane(segments=3))
+    mesh = padded(se.plane(segments=3), np.float64)
     camera = se.frame_mesh(mesh, direction=(0.4, 0.3, 1.0))
     _, _, lights, material = scene(np.float64)
     plain = se.render(mesh, camera, lights, material, **SIZE)
@@ -55,25 +69,21 @@ def test_flat_places_do_not_change(x64):
 
 
 def test_jit_and_eager_agree(x64):
-    mesh, camera, lights, material = scene(x64)
-
-    def picture(alpha, gamma, sigma):
-        return se.render(mesh, camera, lights, material, se.LightWarp(alpha, gamma), sigma=sigma, **SIZE)
-
-    arguments = [jnp.asarray(v) for v in (25.0, 0.3, 1.5)]
-    np.testing.assert_allclose(picture(*arguments), jax.jit(picture)(*arguments), rtol=1e-10, atol=1e-10)
+    warp, sigma = se.LightWarp(25.0, 0.3), 1.5
+    eager = se.render(*scene(x64), warp, sigma=sigma, **SIZE)
+    np.testing.assert_allclose(eager, compiled()(warp, sigma), rtol=1e-10, atol=1e-10)
 
 
 def test_the_picture_does_not_depend_on_the_resolution():
     mesh, camera, lights, material = scene()
     images = [
-        se.render(mesh, camera, lights, material, se.LightWarp(25.0), sigma=8.0, height=h, width=4 * h // 3)
-        for h in (96, 192)
+        se.render(mesh, camera, lights, material, se.LightWarp(25.0), sigma=8.0, height=k * H, width=k * W)
+        for k in (1, 2)
     ]
     small, large = np.asarray(images[0]), np.asarray(images[1])
-    pooled = large.reshape(96, 2, 128, 2, 3).mean(axis=(1, 3))
-    inside = np.ones((96, 128), bool)
-    mask = np.asarray(se.render_gbuffer(mesh, camera, height=96, width=128).mask)
+    pooled = large.reshape(H, 2, W, 2, 3).mean(axis=(1, 3))
+    inside = np.ones((H, W), bool)
+    mask = np.asarray(se.render_gbuffer(mesh, camera, **SIZE).mask)
     for shift in (-2, 2):
         for axis in (0, 1):
             inside &= np.roll(mask, shift, axis)
