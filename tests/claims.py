@@ -524,6 +524,7 @@ claim(
 )
 BRUSH = {"flow": 2.0, "radius": 1.7, "aspect": 0.6, "width": 0.9, "spread": 0.3, "low": 0.1, "high": 1.1, "grow": 0.4}
 BRUSH |= {
+    "shortest": 3.0,
     "shade": 0.3,
     "paper": 0.4,
     "gaps": 0.9,

@@ -91,7 +91,9 @@ def test_equals_the_definition(footprint, twin):
 def test_compaction_changes_nothing():
     """The general variant, as traced, paints the same picture as the one that lists its stamps."""
     profile, field = straight(angle=0.9)
-    brush = se.Brush(color=(0.2, 0.5, 0.9), radius=2.0, wobble=1.0, paper=0.5, gaps=0.5, tint=0.5, shade=0.5)
+    brush = se.Brush(
+        color=(0.2, 0.5, 0.9), radius=2.0, shortest=7.0, wobble=1.0, paper=0.5, gaps=0.5, tint=0.5, shade=0.5
+    )
     rng = np.random.default_rng(1)
     noise = jnp.asarray(rng.random((SIZE, SIZE, CHANNELS)), jnp.float32)
     shading = jnp.asarray(rng.random((SIZE, SIZE, 3)), jnp.float32)
@@ -157,6 +159,26 @@ def test_footprints_swell_with_the_width_of_the_profile():
         np.testing.assert_allclose(swelled, plain, atol=1e-5)
         wide.append(np.count_nonzero(np.asarray(swelled)[:, SIZE // 2, 3] > 0.5))
     assert wide[0] < wide[1] < wide[2]
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.6])
+def test_specks_are_left_out_and_lines_are_kept_to_their_ends(angle):
+    """Of a line that is interrupted twice, the long pieces stay what they are, and the short one goes."""
+    profile, field = straight(angle=angle)
+    along = np.cos(angle) * X + np.sin(angle) * Y
+    speck, left, right = np.abs(along) < 1.3, along < -8, along > 8
+
+    def opacity(own, **options):
+        drawn = replace(profile, valid=profile.valid & jnp.asarray(own))
+        return np.asarray(se.draw_lines(drawn, field, se.Brush(**options), reach=3))[..., 3]
+
+    plain, sifted = (opacity(speck | left | right, shortest=shortest) for shortest in (0.0, 5.0))
+    assert plain[np.abs(along) < 1].max() > 0.5
+    assert not np.any(sifted[np.abs(along) < 3])
+    inner = (np.abs(along) > 10) & (np.abs(X) < 15) & (np.abs(Y) < 15)
+    np.testing.assert_allclose(sifted[inner], plain[inner], atol=1e-5)
+    ends = (np.abs(along) > 8) & (np.abs(along) < 10)
+    assert sifted[ends].sum() > 0.85 * plain[ends].sum()
 
 
 def test_colour_comes_from_the_shading_at_the_skeleton():

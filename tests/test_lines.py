@@ -229,7 +229,7 @@ def test_lines_of_a_noisy_mesh_agglomerate_with_distance():
         camera = se.orthographic_camera((0, -1.2, 2.0), (0, 0, 0), height=1.9 * distance, aspect=1.0)
         gbuffer = se.render_gbuffer(mesh, camera, height=size, width=size)
         descriptor = se.describe(gbuffer, sigma=1.5)
-        brush = se.style_brush("ink", "valley", height=600)
+        brush = replace(se.style_brush("ink", "valley", height=600), shortest=0.0)  # no sieve: what is there is drawn
         field = se.line_field("valley", gbuffer, descriptor)
         profile = se.fit_profile(field, least=float(brush.low))
         drawn = np.asarray(se.draw_lines(profile, field, brush, gbuffer=gbuffer, descriptor=descriptor))[..., 3] > 0.5

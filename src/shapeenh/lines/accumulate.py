@@ -219,7 +219,9 @@ def _read_runs(flat, start, width: int):
 @partial(jax.jit, static_argnames=("function", "reach"))
 def draw_everywhere(profile, field, brush, shading, noise, image, barriers, *, function, reach):
     """All pixels stamp, one offset of the footprint after another: has a gradient, but costs area times footprint."""
-    stamps = stamps_planes(profile, field, brush, shading, noise, colored=True, turned=True, moved=True, grown=True)
+    stamps = stamps_planes(
+        profile, field, brush, shading, noise, colored=True, turned=True, moved=True, grown=True, sifted=True
+    )
     h, w = stamps.weight.shape
     side, dtype = 2 * reach + 1, stamps.weight.dtype
     counted = None if barriers is None else crossings(barriers)

@@ -21,7 +21,7 @@ from shapeenh.checks import check_range, check_shape, check_size, check_type, fl
 from shapeenh.lines.accumulate import crossings_on_host, draw_everywhere, draw_listed, framed_stamps, list_runs
 from shapeenh.lines.depth_steps import depth_barriers
 from shapeenh.lines.noise import CHANNELS
-from shapeenh.lines.stamps import FOOTPRINTS
+from shapeenh.lines.stamps import FOOTPRINTS, LENGTH_WITHIN
 from shapeenh.lines.tiles import list_tiles, margin_for
 from shapeenh.types import Descriptor, GBuffer, LineField, Profile
 
@@ -42,6 +42,8 @@ class Brush:
     width: [], px, > 0, s of the weight: how far from the skeleton stamps are set.
     spread: [], >= 0, added to s: this times sqrt(height / |curvature|), the half width of the profile in px (airbrush).
     low, high: [], heights between which lambda rises from 0 to 1: close together for ink, far apart for a pencil.
+    shortest: [], px, in [0, 8]: where less of a line than this lies within 4 px it fades, and at 0.6 times this it is
+        gone: specks are left out, lines and their ends are kept.
     grow: [], in [0, 1], how much of the footprint's size follows that same rise.
     swell: [], in [0, 1], how much of it follows the half width of the profile, sqrt(height / |curvature|) px, up to
         `radius` (TH10 fig. 8.5).
@@ -61,6 +63,7 @@ class Brush:
     spread: jax.Array | float = 0.0
     low: jax.Array | float = 0.0
     high: jax.Array | float = 1e-6
+    shortest: jax.Array | float = 0.0
     grow: jax.Array | float = 0.0
     swell: jax.Array | float = 0.0
     shade: jax.Array | float = 0.0
@@ -137,7 +140,8 @@ def draw_lines(
     if not concrete:
         barriers = None if gbuffer is None else depth_barriers(gbuffer, descriptor)
         return draw_everywhere(profile, field, brush, shading, noise, image, barriers, **options)
-    valid, margin = np.asarray(profile.valid), _margin(profile, wants["colored"] and float(brush.shade) > 0)
+    valid = np.asarray(profile.valid)
+    margin = _margin(profile, wants["sifted"], wants["colored"] and float(brush.shade) > 0)
     tiles = list_tiles(valid, margin)
     images = profile, field, shading, noise
     stamps = framed_stamps(images, brush, tiles, wants=tuple(wants.items()), margin=margin, reach=reach)
@@ -158,16 +162,20 @@ def _wants(brush, shading, noise, function) -> dict[str, bool]:
         "colored": shaded or tinted,
         "turned": function != "disc",
         "moved": moved,
+        "sifted": float(brush.shortest) > 0,
         "grown": float(brush.grow) > 0 or float(brush.swell) > 0 or (noise is not None and float(brush.uneven) > 0),
     }
 
 
-def _margin(profile, shaded: bool) -> int | None:
-    """How far the stamp of a pixel looks, px: to the skeleton, if that is where it takes its colour from."""
-    if not shaded:
-        return margin_for(0)
-    farthest = np.max(np.abs(np.asarray(profile.distance)), where=np.asarray(profile.valid), initial=0)
-    return margin_for(int(farthest) + 2) if np.isfinite(farthest) else None
+def _margin(profile, sifted: bool, shaded: bool) -> int | None:
+    """How far the stamp of a pixel looks, px: along its line, and to the skeleton if it takes its colour there."""
+    reach = LENGTH_WITHIN if sifted else 0
+    if shaded:
+        farthest = np.max(np.abs(np.asarray(profile.distance)), where=np.asarray(profile.valid), initial=0)
+        if not np.isfinite(farthest):
+            return None
+        reach = max(reach, int(farthest) + 2)
+    return margin_for(reach)
 
 
 def _check_sheets(gbuffer, descriptor, shape) -> None:
@@ -191,6 +199,7 @@ def _check_brush(brush, shading, noise) -> None:
         ("spread", 0, 64, False),
         ("low", -np.inf, np.inf, False),
         ("high", -np.inf, np.inf, False),
+        ("shortest", 0, 2 * LENGTH_WITHIN, False),
         ("grow", 0, 1, False),
         ("swell", 0, 1, False),
         ("shade", 0, 1, False),

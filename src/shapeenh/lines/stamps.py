@@ -11,8 +11,10 @@ from jax import lax
 
 from shapeenh.lines.candidates import read
 from shapeenh.numerics import safe_divide, safe_hypot, safe_sqrt, smoothstep
+from shapeenh.stencils import shift
 
 FOOTPRINTS = ("disc", "ellipse")
+LENGTH_WITHIN = 4  # px to all sides, where the length of a stroke is taken
 _CUT = 1e-3  # taken off all weights, so that stamps fainter than this are none
 
 
@@ -33,7 +35,7 @@ class Stamps(NamedTuple):
 # ------------------------------------------------------------------------------------------- weights (8.2), T_x (8.3)
 
 
-def stamps_planes(profile, field, brush, shading, noise, *, colored, turned, moved, grown) -> Stamps:
+def stamps_planes(profile, field, brush, shading, noise, *, colored, turned, moved, grown, sifted) -> Stamps:
     """The stamps of all pixels; the flags say which planes are wanted."""
     height, distance = profile.height, profile.distance
     rise = smoothstep(brush.low, brush.high, height)
@@ -53,10 +55,12 @@ def stamps_planes(profile, field, brush, shading, noise, *, colored, turned, mov
     weight = brush.flow * bell / total
     if noise is not None:
         weight = weight * (1 - smoothstep(0.3, 0.7, brush.gaps * noise[..., 1]))
+    if sifted:
+        weight = weight * _long_enough(profile, brush)
     weight = jnp.where(usable, weight, 0)
 
     theta_x, theta_y = field.direction[..., 0], field.direction[..., 1]
-    color = shift = None
+    color = move = None
     if colored:
         color = jnp.broadcast_to(brush.color[:, None, None], (3, *height.shape))
         if shading is not None:
@@ -66,13 +70,27 @@ def stamps_planes(profile, field, brush, shading, noise, *, colored, turned, mov
             color = jnp.maximum(color * (1 + 2 * tint)[None] + jnp.maximum(tint, 0)[None] * 0.2, 0)
     if moved and noise is not None:
         wobble = 2 * brush.wobble * (noise[..., 3] - 0.5)
-        shift = jnp.stack([wobble * theta_x, wobble * theta_y])
+        move = jnp.stack([wobble * theta_x, wobble * theta_y])
     if turned and noise is not None:
         angle = brush.twist * (2 * noise[..., 2] - 1)
         cos, sin = jnp.cos(angle), jnp.sin(angle)
         theta_x, theta_y = cos * theta_x - sin * theta_y, sin * theta_x + cos * theta_y
     turn = jnp.stack([-theta_y, theta_x]) if turned else None
-    return Stamps(weight, radius if grown else None, color, turn, shift)
+    return Stamps(weight, radius if grown else None, color, turn, move)
+
+
+def _long_enough(profile, brush):
+    """0 where less of strokes is around a pixel than `brush.shortest` allows, else 1.
+
+    The length of all skeletons in a window is the sum of bells across them, each worth 1 per px of its line.
+    """
+    there = smoothstep(brush.low, 0.7 * brush.low + 0.3 * brush.high, profile.height)
+    bell = jnp.exp(-0.5 * profile.distance**2) / np.sqrt(2 * np.pi).item()
+    length = jnp.where(profile.valid, there * bell, 0)
+    for axis in (0, 1):
+        length = sum(shift(length, k, axis) for k in range(-LENGTH_WITHIN, LENGTH_WITHIN + 1))
+    enough = jnp.where(brush.shortest > 0, brush.shortest, 1)
+    return jnp.where(brush.shortest > 0, smoothstep(0.6 * enough, enough, length), 1)
 
 
 def _at_skeleton(shading, distance, theta_x, theta_y):

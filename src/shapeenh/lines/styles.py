@@ -64,8 +64,9 @@ def style_brush(style: str, kind: str, *, height: int = 600) -> Brush:
     brush = replace(_COMMON[style], **_CHANGES.get((style, kind), {}))
     if style in ("ink", "calligraphy", "dashes"):
         high = low + 0.4 * (high - low)  # there or not there
-    radius = min(max(brush.radius * scale, 0.8), 40.0)
-    return replace(brush, low=low * unit, high=high * unit, radius=radius, wobble=brush.wobble * min(scale, 8))
+    radius, shortest = min(max(brush.radius * scale, 0.8), 40.0), min(5.0 * scale, 8.0)
+    wobble = brush.wobble * min(scale, 8)
+    return replace(brush, low=low * unit, high=high * unit, radius=radius, shortest=shortest, wobble=wobble)
 
 
 def style_footprint(style: str) -> str:
