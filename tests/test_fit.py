@@ -346,10 +346,17 @@ def test_parameters_of_every_stage_are_fitted_singly_and_together(names, whole_p
         assert fitted.parameters[name] != np.float32(start[name])
 
 
-SLOW_TO_COMPILE = [pytest.param(name, marks=pytest.mark.slow) for name in ("lbfgsb", "projected")]
+def solvers(*names, compiled=()):
+    """Pairs of a solver and a precision; of those that compile their whole loop, the second only before a release."""
+    slow = {"float32": pytest.mark.slow, "float64": pytest.mark.thorough}
+    return [(name, dtype) for name in names for dtype in slow] + [
+        pytest.param(name, dtype, marks=slow[dtype]) for name in compiled for dtype in slow
+    ]
 
 
-@pytest.mark.parametrize("solver", ["newton", "scipy", "adam", *SLOW_TO_COMPILE])
+@pytest.mark.parametrize(
+    ("solver", "dtype"), solvers("newton", "scipy", "adam", compiled=("lbfgsb", "projected")), indirect=["dtype"]
+)
 def test_every_solver_meets_the_target(solver, dtype):
     start = {"alpha": jnp.asarray(3.0, dtype), "gamma": jnp.asarray(0.5, dtype)}
     fitted = se.fit_contrast(shaded, 0.25, start, mask=MASK, bounds=BOUNDS, solver=solver)
@@ -638,13 +645,12 @@ def hidden_picture(dtype):
 
 
 @pytest.mark.parametrize(
-    "solver",
+    ("solver", "dtype"),
     [
-        "scipy",
-        "adam",
-        pytest.param("projected", marks=pytest.mark.slow),
-        pytest.param("lbfgsb", marks=pytest.mark.thorough),
+        *solvers("scipy", "adam", compiled=("projected",)),
+        *(pytest.param("lbfgsb", dtype, marks=pytest.mark.thorough) for dtype in ("float32", "float64")),
     ],
+    indirect=["dtype"],
 )
 def test_hidden_parameters_are_recovered_from_their_picture(solver, dtype):
     start = {"alpha": jnp.asarray(5.0, dtype), "gamma": jnp.asarray(-0.2, dtype)}

@@ -418,7 +418,7 @@ def test_every_seen_pixel_has_a_surface(seed, size, parallel):
     assert np.all(length[~mask] == 0)
 
 
-@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.thorough)])
 def test_gradients_are_finite(dtype):
     with jax.enable_x64(dtype == "float64"):
         for seed in range(8):

@@ -145,7 +145,7 @@ def framed(i, faces):
     return camera.view, camera.projection
 
 
-SLOW = pytest.mark.slow
+SLOW, THOROUGH = pytest.mark.slow, pytest.mark.thorough  # what `mapped` interpolates, and samples, in their own tests
 
 
 @pytest.mark.parametrize(
@@ -153,11 +153,11 @@ SLOW = pytest.mark.slow
     [
         seen_mesh,
         pytest.param(seen_points, marks=SLOW),
-        pytest.param(interpolated, marks=SLOW),
+        pytest.param(interpolated, marks=THOROUGH),
         pytest.param(mapped("tangent"), marks=SLOW),
-        pytest.param(mapped("object"), marks=pytest.mark.thorough),
-        pytest.param(sampled, marks=SLOW),
-        pytest.param(rendered, marks=pytest.mark.thorough),
+        pytest.param(mapped("object"), marks=THOROUGH),
+        pytest.param(sampled, marks=THOROUGH),
+        pytest.param(rendered, marks=THOROUGH),
         tables,
         framed,
     ],

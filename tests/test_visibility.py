@@ -172,7 +172,7 @@ def scene(name, rng):
     return *soup(rng, 400, sizes[name]), perspective_camera((0, 0.5, 4), (0, 0, 0), fov_degrees=40, aspect=1.5)
 
 
-@pytest.mark.parametrize("cull", ["none", "back", pytest.param("front", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("cull", ["none", "back", pytest.param("front", marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("name", ["sphere", "inside", "parallel", "around", "dust", "small", "mixed", "large"])
 def test_against_brute_force(dtype, rng, name, cull):
     vertices, faces, camera = scene(name, rng)
@@ -343,7 +343,7 @@ def test_compiled_is_eager_and_both_precisions_agree(rng):
     assert (wide == straight).mean() > 0.995
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_eager_without_jit(rng):
     """Integers leave the compiler no freedom: the same ids from single operations."""
     vertices, faces = tessellation(rng, 9.0, 12, angle=0.3)
