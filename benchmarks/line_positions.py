@@ -39,7 +39,8 @@ def occluding(gbuffer, descriptor, camera) -> dict:
     """How far the points of occlusion lines are from steps of depth of more than a pixel, and those of more than five
     from the lines."""
     field = se.line_field("occlusion", gbuffer, descriptor)
-    profile = se.fit_profile(field, radius=1.5, least=float(se.style_brush("ink", "occlusion").low))
+    least = float(se.style_brush("ink", "occlusion").low)
+    profile = se.fit_profile(field, radius=se.fit_radius("occlusion"), least=least)
     points = line_points(profile, field)
     off = distance_to_borders(points, step_borders(gbuffer, camera, 1.0))
     missed = KDTree(points).query(step_borders(gbuffer, camera, 5.0).mean(axis=1))[0]

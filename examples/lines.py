@@ -23,7 +23,7 @@ def draw(mesh, style: str, *, size: int = 480):
     for kind in ("valley", "ridge", "occlusion"):
         brush = se.style_brush(style, kind, height=size)
         field = se.line_field(kind, gbuffer, descriptor)
-        profile = se.fit_profile(field, radius=1.5 if kind == "occlusion" else 4.0, least=float(brush.low))
+        profile = se.fit_profile(field, radius=se.fit_radius(kind), least=float(brush.low))
         ends = {} if kind == "occlusion" else {"gbuffer": gbuffer, "descriptor": descriptor}
         strokes = se.draw_lines(profile, field, brush, footprint=se.style_footprint(style), noise=noise, **ends)
         picture = se.composite_lines(picture, strokes)

@@ -334,5 +334,5 @@ NOT_NUMERIC = {
     "files": "load_environment load_height load_image load_mesh load_points save_image",
     "made by NumPy on the host": "carved_knot plane sphere torus procedural_sky procedural_studio curvature_legend",
     "display alone": "line_integral_convolution",
-    "look-ups by name": "named_material style_brush style_footprint",
+    "look-ups by name": "fit_radius named_material style_brush style_footprint",
 }

@@ -135,7 +135,7 @@ def test_a_step_no_deeper_than_the_slope_in_front_of_it_has_its_line():
     arrays = [jnp.asarray(a, jnp.float32) for a in (depth, normal, np.stack([X, Y, -depth], -1))]
     gbuffer = GBuffer(jnp.ones((SIZE, SIZE), bool), *arrays)
     field = se.line_field("occlusion", gbuffer, se.describe(gbuffer))
-    found = se.fit_profile(field, radius=1.5, least=0.05)
+    found = se.fit_profile(field, radius=se.fit_radius("occlusion"), least=0.05)
     near = (np.abs(X) < 1) & (np.abs(Y) < 20)
     assert np.all(np.asarray(found.valid)[near])
     np.testing.assert_allclose((X + np.asarray(found.distance) * field.direction[..., 0])[near], 0, atol=0.2)
@@ -198,7 +198,7 @@ def test_occlusion_lines_of_a_mesh_lie_within_a_pixel_of_its_depth_steps(knot):
     gbuffer, descriptor, camera = knot
     field = se.line_field("occlusion", gbuffer, descriptor)
     least = float(se.style_brush("ink", "occlusion").low)
-    points = reference.line_points(se.fit_profile(field, radius=1.5, least=least), field)
+    points = reference.line_points(se.fit_profile(field, radius=se.fit_radius("occlusion"), least=least), field)
     assert len(points) > 1000
     off = reference.distance_to_borders(points, reference.step_borders(gbuffer, camera, 1.0))
     assert np.mean(off <= 1) > 0.9995  # the others run between two steps 3 px apart, so
@@ -394,6 +394,8 @@ def test_bad_arguments_are_named():
     d = se.describe(gbuffer)
     with pytest.raises(ValueError, match="kind is 'crest'; accepted are 'occlusion'"):
         se.line_field("crest", gbuffer, d)
+    with pytest.raises(ValueError, match="kind is 'crest'"):
+        se.fit_radius("crest")
     with pytest.raises(ValueError, match="luminance is not given"):
         se.line_field("luminance", gbuffer, d)
     with pytest.raises(ValueError, match="luminance is given"):

@@ -37,7 +37,7 @@ from shapeenh.light.reflection import shade_diffuse, shade_forward, shade_mirror
 from shapeenh.light.scaling import curvature_mapping, radiance_scale
 from shapeenh.light.warp import unwarp, warp, warp_jacobian, warp_tensor
 from shapeenh.lines.brush import Brush, composite_lines, draw_lines
-from shapeenh.lines.fields import line_field, make_line_field
+from shapeenh.lines.fields import fit_radius, line_field, make_line_field
 from shapeenh.lines.noise import surface_noise
 from shapeenh.lines.profile import fit_profile
 from shapeenh.lines.styles import style_brush, style_footprint
@@ -107,6 +107,7 @@ __all__ = [
     "fit_contrast",
     "fit_image",
     "fit_profile",
+    "fit_radius",
     "frame_mesh",
     "gaussian_curvature",
     "gbuffer_from_height",

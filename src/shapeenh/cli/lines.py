@@ -15,7 +15,7 @@ from shapeenh.cli.terminal import Stopwatch
 from shapeenh.cli.values import UsageError
 from shapeenh.light.radiance import shade
 from shapeenh.lines.brush import NOISY, composite_lines, draw_lines
-from shapeenh.lines.fields import KINDS, line_field, make_line_field
+from shapeenh.lines.fields import KINDS, fit_radius, line_field, make_line_field
 from shapeenh.lines.noise import surface_noise
 from shapeenh.lines.profile import fit_profile
 from shapeenh.lines.styles import STYLES, style_brush, style_footprint
@@ -143,7 +143,7 @@ def object_lines(gbuffer, descriptor, picture, camera, arguments, kinds):
         image = luminance(picture) if kind == "luminance" else None
         field = line_field(kind, gbuffer, descriptor, luminance=image)
         brush = _brush(arguments, kind, height)
-        profile = fit_profile(field, radius=1.5 if kind == "occlusion" else 4.0, least=float(brush.low))
+        profile = fit_profile(field, radius=fit_radius(kind), least=float(brush.low))
         inputs = {"footprint": style_footprint(arguments.style), "shading": picture, "noise": noise}
         if kind != "occlusion":  # those lie on the silhouettes, all others end there
             inputs |= {"gbuffer": gbuffer, "descriptor": descriptor}

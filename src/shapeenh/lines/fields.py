@@ -45,8 +45,8 @@ def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=None) ->
         luminance: [H, W], for kind "luminance" and no other.
         sigma: [], px, in [0, 20]: heights and directions are diffused this far, insulated by silhouettes. None: 1, and
             0 for occlusion. (Occlusion lines live *on* the silhouettes: they are diffused freely, background included,
-            and by 0.65 px more, since a step is thinner than any profile. Fit them with a radius of 1.5: steps less
-            than 2 px apart become one line between them, with larger radii and sigma sooner.)
+            and by 0.65 px more, since a step is thinner than any profile. Steps less than 3 px apart may become one
+            line between them; with larger sigma, or radii of the fit than `fit_radius`, sooner.)
 
     Static: kind.
     Returns: LineField [H, W]; 0 off the mask with singularity 1 there, except occlusion lines, which straddle the
@@ -85,6 +85,19 @@ def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=None) ->
     spread = _STEP_SIGMA if kind == "occlusion" else 0.0
     images = gbuffer, descriptor, luminance
     return smoothed_field(_measure, images, jnp.asarray(sigma, dtype), mask, _anything, spread=spread, kind=kind)
+
+
+def fit_radius(kind: str) -> float:
+    """The radius, px, with which `fit_profile` finds the lines of one kind (SPEC 9.2: 4; steps of depth are thinner).
+
+    Args: kind, as for `line_field`.
+    Returns: 1.5 for occlusion, so that steps next to one another stay apart; else 4.
+    Errors: ValueError for an unknown kind.
+
+    >>> profile = se.fit_profile(field, radius=se.fit_radius("occlusion"))
+    """
+    check_choice("kind", kind, KINDS)
+    return 1.5 if kind == "occlusion" else 4.0
 
 
 def make_line_field(height, direction, *, mask=None, silhouette=None, sigma=0.0) -> LineField:
