@@ -15,9 +15,10 @@ SURE = 0.4, 0.8  # shares of a step, from none to all of it
 _MARGIN = 8
 
 
-def surface_of(gbuffer):
-    """What `depth_steps` reads of a G-buffer."""
-    return lax.stop_gradient((gbuffer.mask, gbuffer.depth, gbuffer.normal, gbuffer.position))
+def surface_of(mask, depth, normal, position):
+    """What `depth_steps` reads of a G-buffer: its mask, and planes that are 0 off it: depth, normal, position."""
+    vectors = [image[..., i] for image in (normal, position) for i in range(3)]
+    return mask, [lax.stop_gradient(jnp.where(mask & jnp.isfinite(p), p, 0)) for p in (depth, *vectors)]
 
 
 def depth_steps(surface, silhouette):
@@ -28,9 +29,7 @@ def depth_steps(surface, silhouette):
     gaps: how far each of them and the pixel are from lying on one smooth surface with the mean of both normals. Off the
     mask everything is far.
     """
-    mask, depth, normal, position = surface
-    vectors = [image[..., i] for image in (normal, position) for i in range(3)]
-    depth, *vectors = [jnp.where(mask & jnp.isfinite(plane), plane, 0) for plane in (depth, *vectors)]
+    mask, (depth, *vectors) = surface
 
     def pair(image, axis):
         return tuple(lax.slice_in_dim(image, i, mask.shape[axis] - 1 + i, axis=axis) for i in (0, 1))
@@ -66,7 +65,7 @@ def depth_barriers(gbuffer, descriptor, *, near=None, around: int = 0):
 
     near: [H, W] bool; only up to `around` pixels from where it is set need the answer be right. None: everywhere.
     """
-    images = surface_of(gbuffer), descriptor.silhouette
+    images = gbuffer.mask, gbuffer.depth, gbuffer.normal, gbuffer.position, descriptor.silhouette
     if is_concrete(images, near):
         tiles = list_tiles(near, _MARGIN, around=around)
         if tiles is not None:
@@ -79,13 +78,21 @@ def _tiled_barriers(images, tiles):
     always = unknown_truth(images[1])
 
     def barriers(images):  # what is cut out is stored, or every neighbour that the stencils read is cut out again
-        return _barriers(stored(always, lambda images: images, images))
+        return _between(*stored(always, _planes, images))
 
     return over_tiles(barriers, images, tiles, (False, False), margin=_MARGIN)
 
 
 @jax.jit
 def _barriers(images):
-    surface, silhouette = images
-    down, across = depth_steps(surface, jnp.where(surface[0] & jnp.isfinite(silhouette), silhouette, 0))
+    return _between(*_planes(images))
+
+
+def _planes(images):
+    *parts, silhouette = images
+    return surface_of(*parts), jnp.where(parts[0] & jnp.isfinite(silhouette), silhouette, 0)
+
+
+def _between(surface, silhouette):
+    down, across = depth_steps(surface, silhouette)
     return jnp.pad(jnp.abs(across) > 0.5, ((0, 0), (0, 1))), jnp.pad(jnp.abs(down) > 0.5, ((0, 1), (0, 0)))

@@ -232,8 +232,8 @@ def _gradient(descriptor, luminance, good, silhouette, kind, always):
 
 def _occlusion(gbuffer, silhouette):
     """|g_d| and its direction, with every step of depth normalised to 1 and slopes taken off."""
-    planes = []
-    for axis, step in enumerate(depth_steps(surface_of(gbuffer), silhouette)):
+    planes, surface = [], surface_of(gbuffer.mask, gbuffer.depth, gbuffer.normal, gbuffer.position)
+    for axis, step in enumerate(depth_steps(surface, silhouette)):
         # half marked at a pixel or two is the fold of a coarse mesh, not an edge
         step = jnp.sign(step) * smoothstep(*SURE, jnp.abs(step))
         before, after = [(0, 0), (0, 0)], [(0, 0), (0, 0)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -9,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from shapeenh.fusion import stored, unknown_truth
 from shapeenh.lines.candidates import read
 from shapeenh.numerics import safe_divide, safe_hypot, safe_sqrt, smoothstep
-from shapeenh.stencils import shift
 
 FOOTPRINTS = ("disc", "ellipse")
 LENGTH_WITHIN = 4  # px to all sides, where the length of a stroke is taken
@@ -84,11 +85,20 @@ def _long_enough(profile, brush):
 
     The length of all skeletons in a window is the sum of bells across them, each worth 1 per px of its line.
     """
-    there = smoothstep(brush.low, 0.7 * brush.low + 0.3 * brush.high, profile.height)
-    bell = jnp.exp(-0.5 * profile.distance**2) / np.sqrt(2 * np.pi).item()
-    length = jnp.where(profile.valid, there * bell, 0)
+
+    def bells(height, distance, valid):
+        there = smoothstep(brush.low, 0.7 * brush.low + 0.3 * brush.high, height)
+        bell = there * jnp.exp(-0.5 * distance**2) / np.sqrt(2 * np.pi).item()
+        return jnp.pad(jnp.where(valid, bell, 0), LENGTH_WITHIN)
+
+    def added(plane, *, axis):
+        size = plane.shape[axis] - 2 * LENGTH_WITHIN
+        return sum(lax.slice_in_dim(plane, k, k + size, axis=axis) for k in range(2 * LENGTH_WITHIN + 1))
+
+    always = unknown_truth(profile.height, profile.distance)
+    length = stored(always, bells, profile.height, profile.distance, profile.valid)
     for axis in (0, 1):
-        length = sum(shift(length, k, axis) for k in range(-LENGTH_WITHIN, LENGTH_WITHIN + 1))
+        length = stored(always, partial(added, axis=axis), length)
     enough = jnp.where(brush.shortest > 0, brush.shortest, 1)
     return jnp.where(brush.shortest > 0, smoothstep(0.6 * enough, enough, length), 1)
 
