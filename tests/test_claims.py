@@ -93,7 +93,7 @@ def check(claim, value, gradient_of, scene, kind, moved):
 
 
 def tier(entry):
-    """What compiles long runs before a release; the whole chain, with all it is made of, in CI."""
+    """What compiles long runs before a release; the whole chain in CI."""
     return pytest.mark.slow if entry.id == "render" else pytest.mark.thorough
 
 
