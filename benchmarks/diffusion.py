@@ -6,7 +6,8 @@ Scenes of 800 x 600: an open rectangle, the same crossed by insulated lines, and
 the depth gradient of the armadillo and its silhouettes. `explicit` and `fast` errors: against the exact semi-discrete
 flow (a converged Chebyshev expansion in float64), those `to a Gaussian` against the continuous heat flow on the open
 rectangle (spectrally); all rms, as a fraction of the input's. The plot: milliseconds against error, a point per sigma.
-`reverse`: value and gradient of a scalar, as multiples of the value's time.
+`reverse`: value and gradient of a scalar, as multiples of the value's time; with respect to the conductance of all
+pixels, and of those on the flanks of silhouettes, where it is neither 0 nor 1, as `describe` does it.
 """
 
 from __future__ import annotations
@@ -21,13 +22,14 @@ from tests.reference import diffusion as reference
 
 import shapeenh as se
 from benchmarks.harness import data, measure, pareto, table, write
-from shapeenh.descriptor.diffusion import diffuse_stacks, levels_for
+from shapeenh.descriptor.diffusion import diffuse_stacks, flank, levels_for
 from shapeenh.stencils import links
 
 
-@partial(jax.jit, static_argnames="levels")
-def run(u, c, time, levels):
-    return diffuse_stacks((u,), *links(c), time, c > 0, time[0, 0] < 1e9, levels=levels, sure=True)[0]
+@partial(jax.jit, static_argnames=("levels", "flanks"))
+def run(u, c, time, levels, flanks=False):
+    marks = flank(c) if flanks else None
+    return diffuse_stacks((u,), *links(c), time, c > 0, marks, time[0, 0] < 1e9, levels, True)[0]
 
 
 def scenes(height, width):
@@ -53,7 +55,13 @@ def rms(error, on) -> float:
     return float(np.sqrt(np.mean(error[:, on] ** 2)))
 
 
-WANTED = {"by planes": 0, "by sigma": 2, "by conductance": 1, "by all": (0, 1, 2)}
+WANTED = {  # in what, and whether in flanks
+    "by planes": (0, False),
+    "by sigma": (2, False),
+    "by flanks": (1, True),
+    "by flanks, planes, sigma": ((0, 1, 2), True),
+    "by conductance": (1, False),
+}
 
 
 def reverse(scene: str, plane, conductance, sigma: float) -> list[dict]:
@@ -62,12 +70,13 @@ def reverse(scene: str, plane, conductance, sigma: float) -> list[dict]:
     time = jnp.full((1, 1), 0.5 * sigma**2, jnp.float32)
     for name, levels in (("explicit", -2), ("fast", levels_for(sigma))):
 
-        def value(u, c, t, levels=levels):
-            out = run(u, c, t, levels)
+        def value(u, c, t, levels=levels, flanks=False):
+            out = run(u, c, t, levels, flanks)
             return jnp.vdot(out, jnp.flip(plane, 1)) + jnp.vdot(out, out)
 
         functions = {"value": jax.jit(value)}
-        functions |= {what: jax.jit(jax.value_and_grad(value, at)) for what, at in WANTED.items()}
+        for what, (at, flanks) in WANTED.items():
+            functions[what] = jax.jit(jax.value_and_grad(partial(value, flanks=flanks), at))
         times = measure({what: partial(f, plane, conductance, time) for what, f in functions.items()}, repeats=5)
         row = {"scene": scene, "sigma": sigma, "scheme": name, "value ms": times["value"]["median_ms"]}
         rows.append(row | {w: round(times[w]["median_ms"] / times["value"]["median_ms"], 2) for w in WANTED})

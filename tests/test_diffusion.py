@@ -9,7 +9,9 @@ import pytest
 from jax.test_util import check_grads
 
 from shapeenh import heat
-from shapeenh.descriptor.diffusion import diffuse_stacks, levels_for
+from shapeenh.descriptor.diffusion import diffuse_stacks, flank, levels_for
+from shapeenh.numerics import smoothstep
+from shapeenh.sparse import few_links
 from shapeenh.stencils import links
 from tests.reference import diffusion as reference
 
@@ -20,7 +22,7 @@ SCHEMES = ("explicit", "fast")
 @partial(jax.jit, static_argnames=("levels", "sure"))
 def _run(u, c, budget, levels, sure):
     always = budget[0, 0] < 1e9
-    return diffuse_stacks((u,), *links(c), budget, c > 0, always, levels=levels, sure=sure)[0]
+    return diffuse_stacks((u,), *links(c), budget, c > 0, None, always, levels, sure)[0]
 
 
 def diffuse(u, c, sigma, scheme="explicit"):
@@ -151,7 +153,7 @@ def test_reverse_mode_of_explicit_steps(x64, rng, budget):
     one = jnp.ones((1, 1))
     for time in (0.13, 3.45):
         b = jnp.full((1, 1), time) if budget == "one" else jnp.asarray(time * rng.random((6, 7)))
-        run = lambda *a: heat.explicit(*a, one, 0.2, (3, 3, 2))  # noqa: E731  several levels of kept states
+        run = lambda *a: heat.explicit(*a, one, None, 0.2, (3, 3, 2))  # noqa: E731  several levels of kept states
         check_grads(run, (u, link_x, link_y, b), order=1, modes=["rev"], rtol=1e-6, atol=1e-6)
 
 
@@ -177,3 +179,50 @@ def test_reverse_mode_of_the_fast_scheme(x64, rng):
         return _run(u, jnp.where(alive, c, 0), (0.5 * sigma**2)[None, None], 1, True)
 
     check_grads(run, (u, c, jnp.asarray(4.2)), order=1, modes=["rev"], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("budget", ["one", "map"])
+def test_a_few_links_get_the_derivative_that_all_would_give_them(x64, rng, budget):
+    u, c = jnp.asarray(rng.standard_normal((2, 6, 7))), jnp.asarray(rng.random((6, 7)))
+    one, ct = jnp.ones((1, 1)), jnp.asarray(rng.standard_normal((2, 6, 7)))
+    b = jnp.full((1, 1), 3.45) if budget == "one" else jnp.asarray(3.45 * rng.random((6, 7)))
+    flags = [jnp.asarray(rng.random((6, 7)) < 0.2) for _ in "xy"]
+    flags = flags[0].at[:, -1].set(False), flags[1].at[-1].set(False)
+
+    def by_few(u, x, y, b):
+        few = few_links(x, y, flags, 20)
+        x, y = jax.lax.stop_gradient((x, y))
+        return jnp.vdot(ct, heat.explicit(u, x, y, b, one, few, 0.2, (3, 3, 2)))
+
+    def by_all(u, x, y, b):
+        return jnp.vdot(ct, heat.explicit(u, x, y, b, one, None, 0.2, (3, 3, 2)))
+
+    at = (u, *links(c), b)
+    few, whole = (jax.jit(jax.grad(f, (0, 1, 2, 3)))(*at) for f in (by_few, by_all))
+    for found, wanted, where in zip(few, whole, (True, flags[0][:, :-1], flags[1][:-1], True), strict=True):
+        np.testing.assert_allclose(found, np.where(where, wanted, 0), atol=1e-13)
+    assert np.abs(few[1]).max() > 0
+
+
+@pytest.mark.parametrize(
+    ("levels", "much"), [(-2, False), (-2, True), (1, False), pytest.param(1, True, marks=pytest.mark.thorough)]
+)
+def test_derivative_through_flanks(x64, rng, levels, much):
+    """That of conductances which come from a smoothstep, whether their flanks are followed singly or all links are."""
+    u, ct = (jnp.asarray(rng.standard_normal((1, *SHAPE))) for _ in "uc")
+    x, time = jnp.asarray(rng.standard_normal(SHAPE) + (1.5 if much else 3.2)), jnp.full((1, 1), 8.82)
+    always = time[0, 0] < 1e9
+    alive = smoothstep(0.0, 1.0, x) > 0
+
+    @partial(jax.jit, static_argnames="marked")
+    def run(u, x, time, marked):
+        c = jnp.where(alive, smoothstep(0.0, 1.0, x), 0)
+        marks = flank(c) if marked else None
+        return jnp.vdot(ct, diffuse_stacks((u,), *links(c), time, alive, marks, always, levels, True)[0])
+
+    count = max(int(jnp.sum(marks)) for marks in flank(smoothstep(0.0, 1.0, x)))
+    assert (count > 256) == much
+    assert count > 50
+    found, wanted = (jax.grad(run, (0, 1, 2))(u, x, time, marked) for marked in (True, False))
+    for a, b in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12 * float(jnp.abs(b).max()))

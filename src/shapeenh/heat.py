@@ -4,7 +4,7 @@ The semi-discrete operator is A g (p) = sum over the four neighbours q of l_pq (
 `stencils.links`. A is symmetric, its rows and columns sum to 0, its off-diagonal entries are not negative: hence the
 three laws (nothing crosses a closed link, the sum over a connected region stays, no new extrema).
 
-Planes are `[C, H, W]`. Imports `fusion` only.
+Planes are `[C, H, W]`. Imports `fusion` and `sparse` only.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 
 from shapeenh.fusion import stored
+from shapeenh.sparse import FewLinks, jumps_at
 
 STEP = 0.2  # at 1/4 a checkerboard would keep its amplitude (SPEC 3.5)
 REPLAYED = 4  # steps between the finest kept states: to take them again costs less than to store and load more states
@@ -65,12 +66,14 @@ def _forward(start, stop, g, fixed, step):
     return lax.fori_loop(start, stop, lambda k, g: _step(k, g, divergence(g, *fixed[:2]), fixed, step), g)
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(5, 6))
-def explicit(planes, link_x, link_y, budget, weight, step=STEP, slots=(SLOTS,) * 4):
+@partial(jax.custom_vjp, nondiff_argnums=(6, 7))
+def explicit(planes, link_x, link_y, budget, weight, few=None, step=STEP, slots=(SLOTS,) * 4):
     """`planes` after each pixel has spent its time `budget` in explicit steps (SPEC 3.5, 3.6).
 
     planes: [C, H, W]; link_x: [H, W-1]; link_y: [H-1, W]; budget: [1, 1] or [H, W], time in px^2, sigma = sqrt(2 time).
     weight: [1, 1] or [H, W], what a pixel makes of one unit of inflow (1, or 1/volume); no gradient.
+    few: None, or the links that alone have a derivative, from `few_links`, where it arrives: `link_x` and `link_y`
+        are to be constants then.
     *Static*: step, the longest step; slots, how many states the reverse sweep keeps per level, coarsest first: the
         number of steps that can be differentiated with respect to links is at most REPLAYED times their product.
     The number of steps is read at run time, so nothing recompiles when the budget changes; the last step is as
@@ -84,25 +87,31 @@ def explicit(planes, link_x, link_y, budget, weight, step=STEP, slots=(SLOTS,) *
 # A is symmetric. With one budget for all, a step takes g to g + dt w A g, and pulls a cotangent lam back to
 # lam + dt A (w lam): the same step, of w lam. So the cotangent is diffused, and no state is needed.
 # The derivative with respect to a pixel's budget is lam w (A g) at its last, short step: that one A g per pixel is kept
-# on the way forward. The derivative with respect to a link is -jump(dt w lam) jump(g) summed over all steps: only where
-# it is asked for is g computed again: kept at some steps, and for the few up to the next taken anew each time.
+# on the way forward. The derivative with respect to a link is -jump(dt w lam) jump(g) summed over all steps. Of a few
+# links the jumps of g are kept on the way forward. Of all, g is kept at some steps, and for the few up to the next
+# taken anew each time.
 
 
-def _explicit_fwd(planes, link_x, link_y, budget, weight, step, slots):
+def _explicit_fwd(planes, link_x, link_y, budget, weight, few, step, slots):
     links_wanted, time_wanted = link_x.perturbed or link_y.perturbed, budget.perturbed
+    few_wanted = few is not None and any(value.perturbed for value in few.values)
+    places = tuple(place.value for place in few.places) if few_wanted else None
     planes, *fixed = (argument.value for argument in (planes, link_x, link_y, budget, weight))
     count = _count(fixed[2], step)
-    states, rate = None, None
-    if fixed[2].shape == (1, 1):
-        last = jnp.maximum(count - 1, 0)
-        states, g = _keep(count, last, planes, fixed, step, slots, links_wanted)
-        rate = divergence(g, *fixed[:2])
-        out = _step(last, g, rate, fixed, step)
+    uniform = fixed[2].shape == (1, 1)
+    last = jnp.maximum(count - 1, 0)
+    stop = last if uniform else count
+    states = kept = rate = None
+    if few_wanted:
+        kept, g = _forward_with_jumps(stop, planes, fixed, step, places, REPLAYED * math.prod(slots))
     else:
-        states, out = _keep(count, count, planes, fixed, step, slots, links_wanted)
-        if time_wanted:
-            out, rate = _forward_with_rate(planes, fixed, step)
-    return out, (fixed, states, rate if time_wanted else None)
+        states, g = _keep(count, stop, planes, fixed, step, slots, links_wanted)
+    if uniform:
+        rate = divergence(g, *fixed[:2])
+        g = _step(last, g, rate, fixed, step)
+    elif time_wanted:
+        g, rate = _forward_with_rate(planes, fixed, step)
+    return g, (fixed, states, (kept, places), rate if time_wanted else None)
 
 
 def _keep(count, stop, planes, fixed, step, slots, wanted: bool):
@@ -110,6 +119,21 @@ def _keep(count, stop, planes, fixed, step, slots, wanted: bool):
     if not wanted or len(slots) < 2:
         return planes if wanted else None, _forward(0, stop, planes, fixed, step)
     return _keep_states(0, count, stop, planes, fixed, step, slots)
+
+
+def _forward_with_jumps(stop, g, fixed, step, places, most: int):
+    """(the jumps of g at `places` before each of at most `most` steps and before step `stop`, g after that many)."""
+
+    def keep(kept, g, k):
+        return [lax.dynamic_update_index_in_dim(a, b, k, 0) for a, b in zip(kept, jumps_at(g, places), strict=True)]
+
+    def one(k, carry):
+        kept, g = carry
+        return keep(kept, g, k), _step(k, g, divergence(g, *fixed[:2]), fixed, step)
+
+    kept = [jnp.zeros((most + 1, g.shape[0], place.size), g.dtype) for place in places]
+    kept, g = lax.fori_loop(0, stop, one, (kept, g))
+    return keep(kept, g, stop), g
 
 
 def _forward_with_rate(planes, fixed, step):
@@ -130,7 +154,7 @@ def _is_last(budget, k, step):
 
 
 def _explicit_bwd(step, slots, saved, lam):
-    fixed, states, rate = saved
+    fixed, states, (kept, places), rate = saved
     link_x, link_y, budget, weight = fixed
     if isinstance(lam, SymbolicZero):
         lam = jnp.zeros(lam.shape, lam.dtype)
@@ -139,23 +163,42 @@ def _explicit_bwd(step, slots, saved, lam):
     if rate is not None:
         d_budget = jnp.sum(weight[None] * lam * rate)[None, None] if uniform else jnp.zeros_like(budget)
     pulled = weight[None] * lam if uniform else lam
-    sums = None
-    if states is None:
-
-        def back(j, carry):
-            pulled, d_budget = carry
-            pulled, d_budget, _ = _pull(count - 1 - j, pulled, d_budget, fixed, rate, step)
-            return pulled, d_budget
-
-        pulled, d_budget = lax.fori_loop(0, count, back, (pulled, d_budget))
-    else:
+    sums = d_few = None
+    if states is not None:
         sums = jnp.zeros_like(link_x), jnp.zeros_like(link_y)
         reverse = _reverse if len(slots) < 2 else _reverse_kept
         pulled, sums, d_budget = reverse(0, count, states, (pulled, sums, d_budget), fixed, rate, step, slots)
+    elif kept is not None:
+        jumps_of_g = lambda k: [lax.dynamic_index_in_dim(jumps, k, 0, False) for jumps in kept]  # noqa: E731
+        jumps = jumps_of_g, partial(jumps_at, places=places)
+        d_few = tuple(jnp.zeros(place.shape, lam.dtype) for place in places)
+        pulled, d_few, d_budget = _sweep(0, count, (pulled, d_few, d_budget), fixed, rate, step, jumps)
+    else:
+        pulled, _, d_budget = _sweep(0, count, (pulled, None, d_budget), fixed, rate, step, None)
     if uniform:
         some = weight[None] > 0
         pulled = jnp.where(some, pulled / jnp.where(some, weight[None], 1), lam)
-    return pulled, *(sums or (None, None)), d_budget, None
+    few = None if d_few is None else FewLinks(d_few, (None, None))
+    return pulled, *(sums or (None, None)), d_budget, None, few
+
+
+def _sweep(start, count, carry, fixed, rate, step, jumps):
+    """Pull `carry` (cotangent, sums of derivatives with respect to links, d_budget) back through steps, the last first.
+
+    jumps: step -> the jumps of g before it, and planes -> their jumps; or None, and there are no sums.
+    """
+
+    def back(j, carry):
+        k = start + count - 1 - j
+        pulled, sums, d_budget = carry
+        pulled, d_budget, factor = _pull(k, pulled, d_budget, fixed, rate, step)
+        if jumps is not None:
+            share = _share(fixed[2][0, 0], k, step) if fixed[2].shape == (1, 1) else 1
+            products = [_over_channels(a * b) for a, b in zip(jumps[0](k), jumps[1](factor), strict=True)]
+            sums = tuple(total - share * product for total, product in zip(sums, products, strict=True))
+        return pulled, sums, d_budget
+
+    return lax.fori_loop(0, count, back, carry)
 
 
 def _pull(k, pulled, d_budget, fixed, rate, step):
@@ -171,12 +214,6 @@ def _pull(k, pulled, d_budget, fixed, rate, step):
         d_budget = d_budget + jnp.where(_is_last(budget, k, step), own, 0)
     spent = (_share(budget, k, step) * weight)[None] * pulled
     return pulled + divergence(spent, link_x, link_y), d_budget, spent
-
-
-def _add_products(sums, g, factor, share):
-    """`sums`, the derivatives with respect to the links, with those of one step added."""
-    products = (_over_channels(a * b) for a, b in zip(_jumps(g), _jumps(factor), strict=True))
-    return tuple(total - share * product for total, product in zip(sums, products, strict=True))
 
 
 def _span(slots) -> int:
@@ -217,14 +254,10 @@ def _reverse(start, count, g, carry, fixed, rate, step, slots):
         states, _ = _keep_states(start, count, start + (count - 1) // span * span, g, fixed, step, slots)
         return _reverse_kept(start, count, states, carry, fixed, rate, step, slots)
 
-    def back(j, carry):
-        k = start + count - 1 - j
-        pulled, sums, d_budget = carry
-        pulled, d_budget, factor = _pull(k, pulled, d_budget, fixed, rate, step)
-        share = _share(fixed[2], k, step) if fixed[2].shape == (1, 1) else 1
-        return pulled, _add_products(sums, _forward(start, k, g, fixed, step), factor, share), d_budget
+    def jumps_of_g(k):
+        return _jumps(_forward(start, k, g, fixed, step))
 
-    return lax.fori_loop(0, count, back, carry)
+    return _sweep(start, count, carry, fixed, rate, step, (jumps_of_g, _jumps))
 
 
 explicit.defvjp(_explicit_fwd, _explicit_bwd, symbolic_zeros=True)

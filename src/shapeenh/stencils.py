@@ -16,6 +16,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from shapeenh.fusion import stored
 from shapeenh.numerics import safe_divide
+from shapeenh.sparse import pull_near
 
 # ------------------------------------------------------------------------------------------- neighbours
 
@@ -202,3 +203,39 @@ def derivatives(planes, link_x, link_y, always):
     reads = (*(down,) * count, *(right,) * count, of_y, of_x)
     d = window(_across, reads, (*(_RIM,) * (2 * count), _MARGIN, _MARGIN), WHOLE, always, *d, link_y, link_x)
     return d[:count], d[count:]
+
+
+@jax.custom_vjp
+def derivatives_beside(planes, link_x, link_y, conductance, always):
+    """`derivatives`, where the links are `links(conductance)` and their derivative is to arrive there.
+
+    Gradient: with respect to planes, and to the conductance where that is between 0 and 1 (it has none elsewhere if it
+        comes from a smoothstep); in reverse mode.
+    """
+    return derivatives(planes, link_x, link_y, always)
+
+
+def _beside_fwd(planes, link_x, link_y, conductance, always):
+    wanted = () if conductance.perturbed else None
+    values = jax.tree.map(lambda leaf: leaf.value, (planes, link_x, link_y, conductance, always))
+    return derivatives_beside(*values), (*values, wanted)
+
+
+def _beside_bwd(saved, cotangents):
+    planes, link_x, link_y, conductance, always, wanted = saved
+    d_x, d_y = jax.tree.map(lambda c: jnp.zeros(c.shape, c.dtype) if isinstance(c, SymbolicZero) else c, cotangents)
+    _, pull = jax.vjp(lambda planes: derivatives(planes, link_x, link_y, always), planes)
+    found = None
+    if wanted is not None:
+
+        def both(conductance, *planes):
+            link_x, link_y = links(conductance)
+            d_x, d_y = derivatives(planes, link_x, link_y, always)
+            return *d_x, *d_y
+
+        flank = (conductance > 0) & (conductance < 1)
+        (found,) = pull_near(flank, 2, both, (conductance,), planes, (*d_x, *d_y))
+    return *pull((d_x, d_y)), None, None, found, None
+
+
+derivatives_beside.defvjp(_beside_fwd, _beside_bwd, symbolic_zeros=True)

@@ -9,12 +9,17 @@ Planes are `[C, H, W]`.
 from __future__ import annotations
 
 import math
+from functools import partial
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 
 from shapeenh.fusion import stored
 from shapeenh.heat import SLOTS, STEP, explicit, slots_for
+from shapeenh.sparse import few_links
 from shapeenh.stencils import shift
 
 GREATEST_SIGMA = 100.0
@@ -144,15 +149,19 @@ def _across(border_x, border_y, role):
     return across_x, jnp.where(cell & shift(cell, 1, -2), border_y, 0)
 
 
+def _over_borders(border_x, border_y):
+    """Sums over those borders of pixels that are borders of blocks; of flags, whether one is set."""
+    over_x, over_y = border_x[0::2] + border_x[1::2], border_y[1::2]
+    return over_x[:, 1::2], over_y[:, 0::2] + over_y[:, 1::2]
+
+
 def _merge(volume, border_x, border_y, role, always):
     """Volumes and borders of the cells."""
     across_x, across_y = stored(always, _across, border_x, border_y, role)
     volume = stored(always, _hand_over, volume, role)
 
     def add(volume, across_x, across_y):
-        over_x = (across_x[0::2] + across_x[1::2])[:, 1::2]
-        over_y = across_y[1::2]
-        return _over_blocks(volume), over_x, over_y[:, 0::2] + over_y[:, 1::2]
+        return _over_blocks(volume), *_over_borders(across_x, across_y)
 
     return stored(always, add, volume, across_x, across_y)
 
@@ -164,8 +173,11 @@ def _conduct(border, volume, axis: int, spacing, step):
     return link[:, :-1] if axis == -1 else link[:-1]
 
 
-def _descend(stacks, level: int, time, cells, always, levels: int, sure: bool):
-    """Diffuse a tuple of plane stacks on the cells of one level for `time`."""
+def _descend(stacks, level: int, time, cells, flank, always, levels: int, sure: bool):
+    """Diffuse a tuple of plane stacks on the cells of one level for `time`.
+
+    flank: the borders that alone have a derivative, flags like those; or None for all.
+    """
     volume, border_x, border_y = cells
     spacing = 2.0**level
     step = STEP * spacing**2
@@ -179,9 +191,15 @@ def _descend(stacks, level: int, time, cells, always, levels: int, sure: bool):
         weight = jnp.where(volume > 0, 1 / jnp.maximum(volume, 1), 0)
         link_x, link_y, weight = stored(always, lambda *planes: planes, link_x, link_y, weight)
 
+    followed = None
+    if flank is not None and level < _LEVELS:
+        # coarser levels have no more flagged links
+        followed = few_links(link_x, link_y, flank, _most(volume.size * 4**level))
+        link_x, link_y = lax.stop_gradient((link_x, link_y))
+
     def smooth(stacks, time, steps):
         slots = slots_for(steps, SLOTS * 4**level)  # coarse states are small
-        return tuple(explicit(planes, link_x, link_y, time, weight, step, slots) for planes in stacks)
+        return tuple(explicit(planes, link_x, link_y, time, weight, followed, step, slots) for planes in stacks)
 
     few = 2 * _SMOOTHING[min(level, 1)] + 2 + _WORTH  # not worth a descent
     if level == levels:
@@ -192,6 +210,7 @@ def _descend(stacks, level: int, time, cells, always, levels: int, sure: bool):
         v, bx, by = _even(volume, size), _even(border_x, size), _even(border_y, size)
         role = _roles(v, bx, by, always, spacing=spacing)
         below = _merge(v, bx, by, role, always)
+        flank_below = flank and _over_borders(_even(flank[0], size), _even(flank[1], size))
 
         def hand_over(planes, role, v):
             return _hand_over(_even(planes, size) * v[None], role)
@@ -211,7 +230,7 @@ def _descend(stacks, level: int, time, cells, always, levels: int, sure: bool):
         aside = jnp.full((1, 1), smoothing, volume.dtype)
         stacks = smooth(stacks, aside, _SMOOTHING[min(level, 1)])
         lower = tuple(down(planes) for planes in stacks)
-        lower = _descend(lower, level + 1, rest, below, always, levels, sure)
+        lower = _descend(lower, level + 1, rest, below, flank_below, always, levels, sure)
         stacks = tuple(up(cells, planes) for cells, planes in zip(lower, stacks, strict=True))
         return smooth(stacks, aside, _SMOOTHING[min(level, 1)])
 
@@ -220,20 +239,92 @@ def _descend(stacks, level: int, time, cells, always, levels: int, sure: bool):
     return lax.cond(rest[0, 0] > _WORTH * step, coarse, lambda stacks: smooth(stacks, time, few), stacks)
 
 
-def diffuse_stacks(stacks, link_x, link_y, budget, alive, always, *, levels: int, sure: bool = False):
+def _diffuse(stacks, link_x, link_y, budget, alive, flank, always, levels: int, sure: bool):
+    if levels >= 0:
+        border_x, border_y = jnp.pad(link_x, ((0, 0), (0, 1))), jnp.pad(link_y, ((0, 1), (0, 0)))
+        cells = alive.astype(link_x.dtype), border_x, border_y
+        return _descend(stacks, 0, budget, cells, flank, always, levels, sure)
+    one, followed, slots = jnp.ones((1, 1), link_x.dtype), None, (SLOTS,) * -levels
+    if flank is not None and len(slots) <= 2:
+        followed = few_links(link_x, link_y, flank, _most(alive.size))
+        link_x, link_y = lax.stop_gradient((link_x, link_y))
+    return tuple(explicit(planes, link_x, link_y, budget, one, followed, STEP, slots) for planes in stacks)
+
+
+# ------------------------------------------------------------------------------------------- few links
+#
+# Nearly everywhere the conductance is 0 or 1 for good: only on the flanks of silhouettes and creases, a few hundred or
+# thousand pixels, does it have a derivative. That of a few links is cheap to follow, that of all is not. How many they
+# are is known at run time: where they are too many, all is done again with all.
+
+
+def flank(conductance):
+    """The links that have a derivative if the conductance has none where it is 0 or 1: flags for `diffuse_stacks`."""
+    steep = (conductance > 0) & (conductance < 1)
+
+    def pairs(axis):
+        either, both = steep | shift(steep, 1, axis), (conductance > 0) & (shift(conductance, 1, axis) > 0)
+        return either & both
+
+    return pairs(-1), pairs(-2)
+
+
+def _most(pixels: int) -> int:
+    """How many links of either direction are followed in an image of so many pixels."""
+    return max(256, pixels // 96)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(7, 8))
+def diffuse_stacks(stacks, link_x, link_y, budget, alive, flank, always, levels: int, sure: bool = False):
     """A tuple of plane stacks, each diffused for the time `budget`.
 
     stacks: each [C, H, W]; link_x, link_y, budget: as in `explicit`; alive: [H, W] bool, conductance > 0.
+    flank: flags of the links along x and y that alone have a derivative, [H, W] where they begin; or None for all.
     always: a true predicate unknown at compile time, for `stored`.
     *Static*: levels: the fast scheme, for a budget of [1, 1], that merges blocks at most so often (`levels_for(sigma)`
         or more; exactly that many if `sure`); or -n, explicit steps, whose
         reverse mode keeps n levels of states (`heat.depth_for`).
     """
-    if levels < 0:
-        one = jnp.ones((1, 1), link_x.dtype)
-        return tuple(explicit(planes, link_x, link_y, budget, one, STEP, (SLOTS,) * -levels) for planes in stacks)
-    border_x, border_y = jnp.pad(link_x, ((0, 0), (0, 1))), jnp.pad(link_y, ((0, 1), (0, 0)))
-    return _descend(stacks, 0, budget, (alive.astype(link_x.dtype), border_x, border_y), always, levels, sure)
+    return _diffuse(stacks, link_x, link_y, budget, alive, None, always, levels, sure)
+
+
+def _pull(moving, arguments, alive, flank, always, levels, sure):
+    """(the result, the function from its cotangent to those of `moving`), of which leaves of `arguments` are."""
+    structure: Any = jax.tree.structure(arguments)
+    leaves = jax.tree.leaves(arguments)
+
+    def run(moving):
+        stacks, x, y, budget = structure.unflatten([moving.get(i, leaf) for i, leaf in enumerate(leaves)])
+        return _diffuse(stacks, x, y, budget, alive, flank, always, levels, sure)
+
+    return jax.vjp(run, moving)
+
+
+def _diffuse_fwd(stacks, link_x, link_y, budget, alive, flank, always, levels, sure):
+    leaves = enumerate(jax.tree.leaves((stacks, link_x, link_y, budget)))
+    moving = {i: leaf.value for i, leaf in leaves if leaf.perturbed}
+    if not (link_x.perturbed or link_y.perturbed):
+        flank = None
+    arguments = stacks, link_x, link_y, budget
+    arguments, alive, flank, always = jax.tree.map(lambda leaf: leaf.value, (arguments, alive, flank, always))
+    out, pull = _pull(moving, arguments, alive, flank, always, levels, sure)
+    return out, (pull, moving, arguments, alive, flank, always)
+
+
+def _diffuse_bwd(levels, sure, saved, cotangents):
+    pull, moving, arguments, alive, flank, always = saved
+    cotangents = tuple(jnp.zeros(c.shape, c.dtype) if isinstance(c, SymbolicZero) else c for c in cotangents)
+    if flank is None:
+        (found,) = pull(cotangents)
+    else:
+        with_all = lambda bars: _pull(moving, arguments, alive, None, always, levels, sure)[1](bars)  # noqa: E731
+        enough = jnp.maximum(*(jnp.sum(flags) for flags in flank)) <= _most(alive.size)
+        (found,) = lax.cond(enough, pull, with_all, cotangents)
+    structure: Any = jax.tree.structure(arguments)
+    return *structure.unflatten([found.get(i) for i in range(structure.num_leaves)]), None, None, None
+
+
+diffuse_stacks.defvjp(_diffuse_fwd, _diffuse_bwd, symbolic_zeros=True)
 
 
 def levels_for(sigma: float) -> int:

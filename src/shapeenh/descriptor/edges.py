@@ -6,10 +6,12 @@ normals already predict is taken off first. Normals and positions are triples of
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 
 from shapeenh.fusion import stored
 from shapeenh.numerics import norm, safe_divide, smoothstep
+from shapeenh.sparse import pull_near
 from shapeenh.stencils import WHOLE, shift, window
 
 # A step counts in units of the distance between neighbouring samples on the surface. Shading normals of real meshes are
@@ -83,9 +85,8 @@ def _step(*values):
     return (jnp.where(on_p * on_q > 0, jnp.where(d[2] > 0, -gap, gap), 0),)
 
 
-def _steps(normal, position, size, finite, always):
+def _steps(planes, always):
     """`_step` from every pixel to its right neighbour, [H, W-1], and to its lower one, [H-1, W]."""
-    planes = (*normal, *position, size, finite.astype(size.dtype))
     domains = (((0, 0), (0, 1)), (0, 0, 0, -1)), (((0, 0), (1, 0)), (0, -1, 0, 0))
     return [window(_step, (reads,) * 8, (WHOLE,) * 8, pairs, always, *planes)[0] for reads, pairs in domains]
 
@@ -102,6 +103,32 @@ def _far_side(*steps):
         behind.append(back - jnp.clip(jnp.maximum(before, ahead), 0, TILT))
         behind.append(-ahead - jnp.clip(jnp.maximum(-beyond, -back), 0, TILT))
     return (smoothstep(LOW, HIGH, jnp.maximum(jnp.maximum(*behind[:2]), jnp.maximum(*behind[2:]))),)
+
+
+def _weight_of(on, always, *planes):
+    """w_s from the planes of normal, position and footprint; on: 1 where these are known, else 0."""
+    step_x, step_y = _steps((*planes, on), always)
+    step_x, step_y = jnp.pad(step_x, ((0, 0), (2, 2))), jnp.pad(step_y, ((2, 2), (0, 0)))
+    reads = tuple((0, k) for k in (0, -1, 1, -2)), tuple((k, 0) for k in (0, -1, 1, -2))
+    return window(_far_side, reads, ((0, 0, 2, 1), (2, 1, 0, 0)), WHOLE, always, step_x, step_y)
+
+
+_weight = jax.custom_vjp(lambda *arguments: _weight_of(*arguments)[0])
+
+
+def _weight_fwd(on, always, *planes):
+    (weight,) = _weight_of(on, always, *planes)
+    return weight, (on, always, planes, weight)
+
+
+def _weight_bwd(saved, cotangent):
+    on, always, planes, weight = saved
+    flank = (weight > 0) & (weight < 1)  # elsewhere the smoothstep is flat
+    weight_of = lambda *planes: _weight_of(planes[-1], always, *planes[:-1])  # noqa: E731
+    return None, None, *pull_near(flank, 2, weight_of, planes, (on,), (cotangent,))
+
+
+_weight.defvjp(_weight_fwd, _weight_bwd)
 
 
 def silhouettes(gbuffer, normal, good, always):
@@ -123,10 +150,7 @@ def silhouettes(gbuffer, normal, good, always):
 
     position, depth, finite = stored(always, clean, gbuffer.position, gbuffer.depth)
     size = footprint(position, depth, finite)
-    step_x, step_y = _steps(normal, position, size, finite, always)
-    step_x, step_y = jnp.pad(step_x, ((0, 0), (2, 2))), jnp.pad(step_y, ((2, 2), (0, 0)))
-    reads = tuple((0, k) for k in (0, -1, 1, -2)), tuple((k, 0) for k in (0, -1, 1, -2))
-    (weight,) = window(_far_side, reads, ((0, 0, 2, 1), (2, 1, 0, 0)), WHOLE, always, step_x, step_y)
+    weight = _weight(finite.astype(size.dtype), always, *normal, *position, size)
     if gbuffer.occlusion is not None:
         open_ = jnp.where(jnp.isfinite(gbuffer.occlusion), gbuffer.occlusion, 1)
         weight = jnp.where(jnp.max(size) > 0, weight, 1 - smoothstep(0.25, 0.75, open_))

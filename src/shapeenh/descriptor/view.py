@@ -14,7 +14,7 @@ from shapeenh.descriptor.box import covering_part, crop, paste
 from shapeenh.fusion import stored, unknown_truth
 from shapeenh.heat import STEP, depth_for
 from shapeenh.numerics import determinant, eigenvalues, safe_divide, safe_hypot
-from shapeenh.stencils import derivatives, links
+from shapeenh.stencils import derivatives_beside, links
 from shapeenh.types import Descriptor, GBuffer, replace
 
 CREASE_DEGREES = 40.0
@@ -199,7 +199,8 @@ def _describe_all(gbuffer, sigma, foreshortening, importance, degrees, *, smooth
         budget = _budget(sigma, importance)
         stacks = (g, places)  # of two planes: four at once overflow the cache
         levels, sure, chart = smoothing
-        g, places = diffusion.diffuse_stacks(stacks, link_x, link_y, budget, c > 0, always, levels=levels, sure=sure)
+        flank = diffusion.flank(c)
+        g, places = diffusion.diffuse_stacks(stacks, link_x, link_y, budget, c > 0, flank, always, levels, sure)
         bend = jnp.exp(-8 * jnp.max(budget)) if chart else None  # type: ignore[assignment]
 
     # 7: the Hessian, flat at the singular places
@@ -265,5 +266,5 @@ def _hessian(g, places, link_x, link_y, c, foreshortening, bend, always):
         return unit * (m_xx * u_x + m_xy * u_y), (0.5 * unit) * xy, unit * (m_yx * v_x + m_yy * v_y)
 
     planes = tuple(g) if bend is None else stored(always, lambda g: gradient.to_chart(g, foreshortening, bend), g)
-    d = derivatives(planes, link_x, link_y, always)
-    return stored(always, displaced, g, *d, *derivatives(tuple(places), link_x, link_y, always), c)
+    d, e = (derivatives_beside(tuple(p), link_x, link_y, c, always) for p in (planes, places))
+    return stored(always, displaced, g, *d, *e, c)

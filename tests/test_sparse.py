@@ -1,0 +1,67 @@
+"""Reverse mode for a few pixels alone equals that for all."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from shapeenh.numerics import smoothstep
+from shapeenh.sparse import few_links, pull_near
+from shapeenh.stencils import derivatives, derivatives_beside, links, shift
+
+SHAPE = (70, 90)
+
+
+def bent(a, b):
+    """Depends on what is two pixels away, and on where the image ends."""
+    return a * shift(b, 2, 0) + jnp.sin(shift(a, -2, 1)), shift(shift(a * b, 1, 0), -1, 1)
+
+
+@pytest.mark.parametrize("share", [0, 0.002, 0.3])
+@pytest.mark.parametrize("shape", [SHAPE, (20, 90), (25, 24)])
+def test_pulling_near_flags(x64, rng, shape, share):
+    a, b, c, d = (jnp.asarray(rng.standard_normal(shape)) for _ in range(4))
+    flags = rng.random(shape) < share
+    flags[-1, -1] = flags[0, 0] = share > 0
+    wanted = jax.vjp(lambda a: bent(a, b), a)[1]((c, d))[0]
+    (found,) = jax.jit(lambda *x: pull_near(jnp.asarray(flags), 2, bent, (x[0],), (x[1],), x[2:]))(a, b, c, d)
+    near = np.zeros(shape, bool)
+    for row, column in zip(*np.nonzero(flags), strict=True):
+        near[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = True
+    np.testing.assert_allclose(np.where(near, found, 0), np.where(near, wanted, 0), atol=1e-14)
+    far = np.asarray(found)[~near]
+    assert np.all((far == 0) | (np.abs(far - np.asarray(wanted)[~near]) < 1e-14))
+
+
+def test_the_places_of_a_few_links(rng):
+    link_x, link_y = (jnp.asarray(rng.random(shape), jnp.float32) for shape in ((9, 10), (8, 11)))
+    flags = rng.random((2, 9, 11)) < 0.2
+    flags[0, :, -1] = flags[1, -1] = False
+    few = few_links(link_x, link_y, tuple(map(jnp.asarray, flags)), 40)
+    for place, value, flag, link in zip(few.places, few.values, flags, (link_x, link_y), strict=True):
+        n = flag.sum()
+        np.testing.assert_array_equal(place[:n], np.flatnonzero(flag))
+        assert np.all(place[n:] == 9 * 11 - 1)
+        assert np.all(value[n:] == 0)
+        np.testing.assert_array_equal(value[:n], np.asarray(link)[np.nonzero(flag)])
+
+
+def test_derivatives_beside_flanks(x64, rng):
+    planes = tuple(jnp.asarray(rng.standard_normal(SHAPE)) for _ in range(2))
+    x = jnp.asarray(rng.standard_normal(SHAPE) + 1.5)
+    bars = [jnp.asarray(rng.standard_normal(SHAPE)) for _ in range(4)]
+
+    def value(planes, x, beside):
+        c, always = smoothstep(0.0, 1.0, x), x[0, 0] < 1e9
+        link_x, link_y = links(c)
+        if beside:
+            link_x, link_y = jax.lax.stop_gradient((link_x, link_y))
+            d_x, d_y = derivatives_beside(planes, link_x, link_y, c, always)
+        else:
+            d_x, d_y = derivatives(planes, link_x, link_y, always)
+        return sum(jnp.vdot(a, b) for a, b in zip((*d_x, *d_y), bars, strict=True))
+
+    found, wanted = (jax.jit(jax.grad(value, (0, 1)), static_argnums=2)(planes, x, b) for b in (True, False))
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-13)
+    assert np.abs(found[1]).max() > 0.1
