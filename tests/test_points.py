@@ -430,6 +430,18 @@ def test_gradients_are_finite(dtype):
                 assert all(bool(jnp.isfinite(g).all()) for g in GRADIENT(arguments, weights)[0])
 
 
+def test_a_ray_within_the_plane_of_a_disc_meets_nothing():
+    """Its determinant is rounding, and may be so small that its square is 0: 0 <= 0 is no hit."""
+    disc = np.zeros((1, splat.GEOMETRY), np.float32)
+    disc[0, [0, 4]] = 1e-25, 1e-5  # X = 1e-25 a, Y = 1e-5 b, W = 1: qa = 1e-28, q = 1e-30
+    disc[0, [2, 8]] = 1e-23, 1
+    zero = jnp.zeros((1, 1), jnp.float32)
+    a, b, hit = splat.meet(jnp.asarray(disc), zero, zero)
+    assert not hit.any()
+    assert np.all(a == 0)
+    assert np.all(b == 0)
+
+
 def test_errors(rng):
     camera = cameras(np.float32)["perspective"]
     points, normals, radius, colors = cloud(10, rng)

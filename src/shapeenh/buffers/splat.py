@@ -39,7 +39,8 @@ def meet(disc, x, y, *, slack: float = 0.0):
     k = [col(i) - x * col(6 + i) for i in range(3)]
     m = [col(3 + i) - y * col(6 + i) for i in range(3)]
     qa, qb, q = k[1] * m[2] - k[2] * m[1], k[2] * m[0] - k[0] * m[2], k[0] * m[1] - k[1] * m[0]
-    hit = (qa * qa + qb * qb <= (1 + slack) * (q * q)) & (q != 0)
+    square = q * q  # 0 also where q underflows: such a disc is seen edge-on
+    hit = (qa * qa + qb * qb <= (1 + slack) * square) & (square >= jnp.finfo(disc.dtype).tiny)
     q = jnp.where(hit, q, 1)
     a, b = jnp.where(hit, qa / q, 0), jnp.where(hit, qb / q, 0)
     hit &= col(6) * a + col(7) * b + col(8) > 0
