@@ -3,7 +3,7 @@
 Each writes `results/NAME.json` with the machine, the versions, compile and run apart, and, where its question is one of
 time against error, the plot `results/NAME.png` with the default ringed; `results/README.md` has all answers. Real
 meshes and maps are used where SHAPEENH_DATA names a folder that has them. Nothing else should run on the machine
-meanwhile. `--quick` takes some minutes instead of most of an hour: small images, three runs of each, results in
+meanwhile. `--quick` takes a quarter of an hour instead of a whole one: small images, three runs of each, results in
 `results/quick/`.
 """
 
