@@ -15,10 +15,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_derivatives import SymbolicZero
 
 from shapeenh.fusion import stored
-from shapeenh.sparse import FewLinks, jumps_at
+from shapeenh.sparse import FewLinks, dense, jumps_at
 
 STEP = 0.2  # at 1/4 a checkerboard would keep its amplitude (SPEC 3.5)
 REPLAYED = 4  # steps between the finest kept states: to take them again costs less than to store and load more states
@@ -156,8 +155,7 @@ def _is_last(budget, k, step):
 def _explicit_bwd(step, slots, saved, lam):
     fixed, states, (kept, places), rate = saved
     link_x, link_y, budget, weight = fixed
-    if isinstance(lam, SymbolicZero):
-        lam = jnp.zeros(lam.shape, lam.dtype)
+    lam = dense(lam)
     count, uniform = _count(budget, step), budget.shape == (1, 1)
     d_budget = None
     if rate is not None:

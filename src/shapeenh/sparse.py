@@ -12,6 +12,18 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
+
+
+def steep(weight):
+    """Where a weight in [0, 1] that comes from a smoothstep has a derivative: at 0 and at 1 it has none."""
+    return (weight > 0) & (weight < 1)
+
+
+def dense(cotangent):
+    """A cotangent as an array, also where JAX knows it to be 0."""
+    return jnp.zeros(cotangent.shape, cotangent.dtype) if isinstance(cotangent, SymbolicZero) else cotangent
+
 
 # ------------------------------------------------------------------------------------------- a few links
 
@@ -93,13 +105,11 @@ def pull_near(flags, reach: int, function, arrays, fixed, cotangents):
         return pull(arrays, fixed, cotangents)
     corners, count = _tiles_near(flags)
 
-    def cut(image, start, size):
-        return jax.vmap(lambda start: lax.dynamic_slice(image, start, (size, size)))(start)
-
     def batch(i, out):
         corner = lax.dynamic_slice_in_dim(corners, i * _BATCH, _BATCH)
         start = jnp.clip(corner - 2 * reach, 0, jnp.asarray([shape]) - side)
-        parts = jax.tree.map(lambda image: cut(image, start, side), (arrays, fixed, cotangents))
+        cut = jax.vmap(lambda image, start: lax.dynamic_slice(image, start, (side, side)), (None, 0))
+        parts = jax.tree.map(lambda image: cut(image, start), (arrays, fixed, cotangents))
         found = jax.vmap(pull)(*parts)
 
         def write(k, out):

@@ -12,11 +12,10 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_derivatives import SymbolicZero
 
 from shapeenh.fusion import stored
 from shapeenh.numerics import safe_divide
-from shapeenh.sparse import pull_near
+from shapeenh.sparse import dense, pull_near, steep
 
 # ------------------------------------------------------------------------------------------- neighbours
 
@@ -113,7 +112,7 @@ def _window_bwd(point, offsets, held, domain, saved, cotangents):
                 totals.append(sum(_slice(bar, wide, own, (-down, -right)) for bar, (down, right) in found))
         return totals
 
-    cotangents = [jnp.zeros(c.shape, c.dtype) if isinstance(c, SymbolicZero) else c for c in cotangents]
+    cotangents = [dense(c) for c in cotangents]
     totals = iter(stored(always, pulled, *stored(always, padded, arrays, cotangents)))
     return None, *(None if asked is None else next(totals) for asked in wanted)
 
@@ -223,7 +222,7 @@ def _beside_fwd(planes, link_x, link_y, conductance, always):
 
 def _beside_bwd(saved, cotangents):
     planes, link_x, link_y, conductance, always, wanted = saved
-    d_x, d_y = jax.tree.map(lambda c: jnp.zeros(c.shape, c.dtype) if isinstance(c, SymbolicZero) else c, cotangents)
+    d_x, d_y = jax.tree.map(dense, cotangents)
     _, pull = jax.vjp(lambda planes: derivatives(planes, link_x, link_y, always), planes)
     found = None
     if wanted is not None:
@@ -233,8 +232,7 @@ def _beside_bwd(saved, cotangents):
             d_x, d_y = derivatives(planes, link_x, link_y, always)
             return *d_x, *d_y
 
-        flank = (conductance > 0) & (conductance < 1)
-        (found,) = pull_near(flank, 2, both, (conductance,), planes, (*d_x, *d_y))
+        (found,) = pull_near(steep(conductance), 2, both, (conductance,), planes, (*d_x, *d_y))
     return *pull((d_x, d_y)), None, None, found, None
 
 

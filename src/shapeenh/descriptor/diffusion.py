@@ -15,11 +15,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_derivatives import SymbolicZero
 
 from shapeenh.fusion import stored
 from shapeenh.heat import SLOTS, STEP, explicit, slots_for
-from shapeenh.sparse import few_links
+from shapeenh.sparse import dense, few_links, steep
 from shapeenh.stencils import shift
 
 GREATEST_SIGMA = 100.0
@@ -191,19 +190,17 @@ def _descend(stacks, level: int, time, cells, flank, always, levels: int, sure: 
         weight = jnp.where(volume > 0, 1 / jnp.maximum(volume, 1), 0)
         link_x, link_y, weight = stored(always, lambda *planes: planes, link_x, link_y, weight)
 
-    followed = None
-    if flank is not None and level < _LEVELS:
-        # coarser levels have no more flagged links
-        followed = few_links(link_x, link_y, flank, _most(volume.size * 4**level))
-        link_x, link_y = lax.stop_gradient((link_x, link_y))
+    # coarser levels have no more flagged links, and the last one takes too many steps to keep what they leave
+    marks = flank if level < _LEVELS else None
+    followed, link_x, link_y = _followed(link_x, link_y, marks, _most(volume.size * 4**level))
 
     def smooth(stacks, time, steps):
         slots = slots_for(steps, SLOTS * 4**level)  # coarse states are small
         return tuple(explicit(planes, link_x, link_y, time, weight, followed, step, slots) for planes in stacks)
 
-    few = 2 * _SMOOTHING[min(level, 1)] + 2 + _WORTH  # not worth a descent
+    direct = 2 * _SMOOTHING[min(level, 1)] + 2 + _WORTH  # steps that are not worth a descent
     if level == levels:
-        return smooth(stacks, time, few if levels < _LEVELS else math.ceil(0.5 * GREATEST_SIGMA**2 / step))
+        return smooth(stacks, time, direct if levels < _LEVELS else math.ceil(0.5 * GREATEST_SIGMA**2 / step))
 
     def coarse(stacks):
         size = h, w = volume.shape
@@ -236,7 +233,7 @@ def _descend(stacks, level: int, time, cells, flank, always, levels: int, sure: 
 
     if sure:
         return coarse(stacks)
-    return lax.cond(rest[0, 0] > _WORTH * step, coarse, lambda stacks: smooth(stacks, time, few), stacks)
+    return lax.cond(rest[0, 0] > _WORTH * step, coarse, lambda stacks: smooth(stacks, time, direct), stacks)
 
 
 def _diffuse(stacks, link_x, link_y, budget, alive, flank, always, levels: int, sure: bool):
@@ -244,10 +241,9 @@ def _diffuse(stacks, link_x, link_y, budget, alive, flank, always, levels: int, 
         border_x, border_y = jnp.pad(link_x, ((0, 0), (0, 1))), jnp.pad(link_y, ((0, 1), (0, 0)))
         cells = alive.astype(link_x.dtype), border_x, border_y
         return _descend(stacks, 0, budget, cells, flank, always, levels, sure)
-    one, followed, slots = jnp.ones((1, 1), link_x.dtype), None, (SLOTS,) * -levels
-    if flank is not None and len(slots) <= 2:
-        followed = few_links(link_x, link_y, flank, _most(alive.size))
-        link_x, link_y = lax.stop_gradient((link_x, link_y))
+    one, slots = jnp.ones((1, 1), link_x.dtype), (SLOTS,) * -levels
+    marks = flank if len(slots) <= 2 else None  # more steps leave too much to keep
+    followed, link_x, link_y = _followed(link_x, link_y, marks, _most(alive.size))
     return tuple(explicit(planes, link_x, link_y, budget, one, followed, STEP, slots) for planes in stacks)
 
 
@@ -260,11 +256,10 @@ def _diffuse(stacks, link_x, link_y, budget, alive, flank, always, levels: int, 
 
 def flank(conductance):
     """The links that have a derivative if the conductance has none where it is 0 or 1: flags for `diffuse_stacks`."""
-    steep = (conductance > 0) & (conductance < 1)
+    some, open_ = steep(conductance), conductance > 0
 
     def pairs(axis):
-        either, both = steep | shift(steep, 1, axis), (conductance > 0) & (shift(conductance, 1, axis) > 0)
-        return either & both
+        return (some | shift(some, 1, axis)) & open_ & shift(open_, 1, axis)
 
     return pairs(-1), pairs(-2)
 
@@ -272,6 +267,13 @@ def flank(conductance):
 def _most(pixels: int) -> int:
     """How many links of either direction are followed in an image of so many pixels."""
     return max(256, pixels // 96)
+
+
+def _followed(link_x, link_y, flank, most: int):
+    """(the flank's links, then all of them as constants); without a flank (None, the links)."""
+    if flank is None:
+        return None, link_x, link_y
+    return few_links(link_x, link_y, flank, most), *lax.stop_gradient((link_x, link_y))
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(7, 8))
@@ -282,8 +284,8 @@ def diffuse_stacks(stacks, link_x, link_y, budget, alive, flank, always, levels:
     flank: flags of the links along x and y that alone have a derivative, [H, W] where they begin; or None for all.
     always: a true predicate unknown at compile time, for `stored`.
     *Static*: levels: the fast scheme, for a budget of [1, 1], that merges blocks at most so often (`levels_for(sigma)`
-        or more; exactly that many if `sure`); or -n, explicit steps, whose
-        reverse mode keeps n levels of states (`heat.depth_for`).
+        or more; exactly that many if `sure`); or -n, explicit steps, whose reverse mode
+        keeps n levels of states (`heat.depth_for`).
     """
     return _diffuse(stacks, link_x, link_y, budget, alive, None, always, levels, sure)
 
@@ -313,7 +315,7 @@ def _diffuse_fwd(stacks, link_x, link_y, budget, alive, flank, always, levels, s
 
 def _diffuse_bwd(levels, sure, saved, cotangents):
     pull, moving, arguments, alive, flank, always = saved
-    cotangents = tuple(jnp.zeros(c.shape, c.dtype) if isinstance(c, SymbolicZero) else c for c in cotangents)
+    cotangents = tuple(dense(c) for c in cotangents)
     if flank is None:
         (found,) = pull(cotangents)
     else:

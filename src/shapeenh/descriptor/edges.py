@@ -6,12 +6,14 @@ normals already predict is taken off first. Normals and positions are triples of
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
 from shapeenh.fusion import stored
 from shapeenh.numerics import norm, safe_divide, smoothstep
-from shapeenh.sparse import pull_near
+from shapeenh.sparse import pull_near, steep
 from shapeenh.stencils import WHOLE, shift, window
 
 # A step counts in units of the distance between neighbouring samples on the surface. Shading normals of real meshes are
@@ -105,9 +107,9 @@ def _far_side(*steps):
     return (smoothstep(LOW, HIGH, jnp.maximum(jnp.maximum(*behind[:2]), jnp.maximum(*behind[2:]))),)
 
 
-def _weight_of(on, always, *planes):
-    """w_s from the planes of normal, position and footprint; on: 1 where these are known, else 0."""
-    step_x, step_y = _steps((*planes, on), always)
+def _weight_of(always, *planes):
+    """w_s from the planes of normal, position, footprint, and 1 where these are known, else 0."""
+    step_x, step_y = _steps(planes, always)
     step_x, step_y = jnp.pad(step_x, ((0, 0), (2, 2))), jnp.pad(step_y, ((2, 2), (0, 0)))
     reads = tuple((0, k) for k in (0, -1, 1, -2)), tuple((k, 0) for k in (0, -1, 1, -2))
     return window(_far_side, reads, ((0, 0, 2, 1), (2, 1, 0, 0)), WHOLE, always, step_x, step_y)
@@ -116,16 +118,14 @@ def _weight_of(on, always, *planes):
 _weight = jax.custom_vjp(lambda *arguments: _weight_of(*arguments)[0])
 
 
-def _weight_fwd(on, always, *planes):
-    (weight,) = _weight_of(on, always, *planes)
-    return weight, (on, always, planes, weight)
+def _weight_fwd(always, *planes):
+    (weight,) = _weight_of(always, *planes)
+    return weight, (always, planes, weight)
 
 
 def _weight_bwd(saved, cotangent):
-    on, always, planes, weight = saved
-    flank = (weight > 0) & (weight < 1)  # elsewhere the smoothstep is flat
-    weight_of = lambda *planes: _weight_of(planes[-1], always, *planes[:-1])  # noqa: E731
-    return None, None, *pull_near(flank, 2, weight_of, planes, (on,), (cotangent,))
+    always, (*planes, on), weight = saved
+    return None, *pull_near(steep(weight), 2, partial(_weight_of, always), tuple(planes), (on,), (cotangent,)), None
 
 
 _weight.defvjp(_weight_fwd, _weight_bwd)
@@ -150,7 +150,7 @@ def silhouettes(gbuffer, normal, good, always):
 
     position, depth, finite = stored(always, clean, gbuffer.position, gbuffer.depth)
     size = footprint(position, depth, finite)
-    weight = _weight(finite.astype(size.dtype), always, *normal, *position, size)
+    weight = _weight(always, *normal, *position, size, finite.astype(size.dtype))
     if gbuffer.occlusion is not None:
         open_ = jnp.where(jnp.isfinite(gbuffer.occlusion), gbuffer.occlusion, 1)
         weight = jnp.where(jnp.max(size) > 0, weight, 1 - smoothstep(0.25, 0.75, open_))

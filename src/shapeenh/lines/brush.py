@@ -19,7 +19,7 @@ from jax.tree_util import register_dataclass
 
 from shapeenh.checks import check_range, check_shape, check_size, check_type, float_dtype, is_concrete
 from shapeenh.lines.accumulate import crossings_on_host, draw_everywhere, draw_listed, framed_stamps, list_runs
-from shapeenh.lines.depth_steps import depth_barriers
+from shapeenh.lines.depth_steps import check_surface, depth_barriers
 from shapeenh.lines.noise import CHANNELS
 from shapeenh.lines.stamps import FOOTPRINTS, LENGTH_WITHIN
 from shapeenh.lines.tiles import list_tiles, margin_for
@@ -183,8 +183,7 @@ def _check_sheets(gbuffer, descriptor, shape) -> None:
         return
     check_type("gbuffer", gbuffer, GBuffer)
     check_type("descriptor", descriptor, Descriptor)
-    for name, tail in (("depth", ()), ("normal", (3,)), ("position", (3,))):
-        check_shape(f"gbuffer.{name}", getattr(gbuffer, name), (*shape, *tail))
+    check_surface(gbuffer, shape)
     check_shape("descriptor.silhouette", descriptor.silhouette, shape)
 
 

@@ -6,13 +6,26 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from shapeenh.checks import is_concrete
+from shapeenh.checks import check_shape, is_concrete
 from shapeenh.fusion import stored, unknown_truth
 from shapeenh.lines.tiles import list_tiles, over_tiles
 from shapeenh.numerics import safe_divide, smoothstep
 
 SURE = 0.4, 0.8  # shares of a step, from none to all of it
 _MARGIN = 8
+
+
+def check_surface(gbuffer, shape) -> None:
+    """Shapes of the fields that steps are read off."""
+    for name, tail in (("depth", ()), ("normal", (3,)), ("position", (3,))):
+        check_shape(f"gbuffer.{name}", getattr(gbuffer, name), (*shape, *tail))
+
+
+def at_pixels(pairs, axis: int):
+    """What pairs of neighbours along an axis show: at the second pixel of each, and at the first; else 0."""
+    second, first = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
+    second[axis], first[axis] = (1, 0), (0, 1)
+    return jnp.pad(pairs, second), jnp.pad(pairs, first)
 
 
 def surface_of(mask, depth, normal, position):
@@ -43,9 +56,8 @@ def depth_steps(surface, silhouette):
 
     def widest(axis, sign, gap):
         """Per pixel, the wider gap of those of its pairs along an axis of which it is the far one."""
-        before, after = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
-        before[axis], after[axis] = (1, 0), (0, 1)
-        return jnp.maximum(jnp.pad(jnp.where(sign > 0, gap, 0), before), jnp.pad(jnp.where(sign < 0, gap, 0), after))
+        behind, before = jnp.where(sign > 0, gap, 0), jnp.where(sign < 0, gap, 0)
+        return jnp.maximum(at_pixels(behind, axis)[0], at_pixels(before, axis)[1])
 
     pairs = [steps(axis) for axis in (0, 1)]
     largest = jnp.maximum(*(widest(axis, sign, gap) for axis, (_, _, sign, gap, _) in enumerate(pairs)))

@@ -11,7 +11,7 @@ from jax import lax
 
 from shapeenh.checks import check_choice, check_range, check_shape, check_type, float_dtype
 from shapeenh.fusion import stored, unknown_truth
-from shapeenh.lines.depth_steps import SURE, depth_steps, surface_of
+from shapeenh.lines.depth_steps import SURE, at_pixels, check_surface, depth_steps, surface_of
 from shapeenh.lines.smoothing import LEAST_HEIGHT, prepare, smoothed_field
 from shapeenh.numerics import safe_divide, safe_hypot, smoothstep
 from shapeenh.stencils import derivatives, links, shift
@@ -76,8 +76,7 @@ def line_field(kind: str, gbuffer, descriptor, *, luminance=None, sigma=None) ->
         h, w = np.shape(gbuffer.mask)
         for name, tail in (("hessian", (3,)), ("gradient", (2,)), ("silhouette", ())):
             check_shape(f"descriptor.{name}", getattr(descriptor, name), (h, w, *tail))
-        for name, tail in (("depth", ()), ("normal", (3,)), ("position", (3,))):
-            check_shape(f"gbuffer.{name}", getattr(gbuffer, name), (h, w, *tail))
+        check_surface(gbuffer, (h, w))
         if luminance is not None:
             check_shape("luminance", luminance, (h, w))
         dtype = float_dtype(descriptor.hessian)
@@ -236,9 +235,7 @@ def _occlusion(gbuffer, silhouette):
     for axis, step in enumerate(depth_steps(surface, silhouette)):
         # half marked at a pixel or two is the fold of a coarse mesh, not an edge
         step = jnp.sign(step) * smoothstep(*SURE, jnp.abs(step))
-        before, after = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
-        before[axis], after[axis] = (1, 0), (0, 1)
-        half = 0.5 * (jnp.pad(step, before) + jnp.pad(step, after))
+        half = 0.5 * sum(at_pixels(step, axis))
         other = 1 - axis
         planes.append(0.5 * half + 0.25 * (shift(half, 1, other) + shift(half, -1, other)))  # Sobel
     g_x, g_y = planes[1], -planes[0]

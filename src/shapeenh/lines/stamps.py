@@ -61,7 +61,7 @@ def stamps_planes(profile, field, brush, shading, noise, *, colored, turned, mov
     weight = jnp.where(usable, weight, 0)
 
     theta_x, theta_y = field.direction[..., 0], field.direction[..., 1]
-    color = move = None
+    color = shift = None
     if colored:
         color = jnp.broadcast_to(brush.color[:, None, None], (3, *height.shape))
         if shading is not None:
@@ -71,13 +71,13 @@ def stamps_planes(profile, field, brush, shading, noise, *, colored, turned, mov
             color = jnp.maximum(color * (1 + 2 * tint)[None] + jnp.maximum(tint, 0)[None] * 0.2, 0)
     if moved and noise is not None:
         wobble = 2 * brush.wobble * (noise[..., 3] - 0.5)
-        move = jnp.stack([wobble * theta_x, wobble * theta_y])
+        shift = jnp.stack([wobble * theta_x, wobble * theta_y])
     if turned and noise is not None:
         angle = brush.twist * (2 * noise[..., 2] - 1)
         cos, sin = jnp.cos(angle), jnp.sin(angle)
         theta_x, theta_y = cos * theta_x - sin * theta_y, sin * theta_x + cos * theta_y
     turn = jnp.stack([-theta_y, theta_x]) if turned else None
-    return Stamps(weight, radius if grown else None, color, turn, move)
+    return Stamps(weight, radius if grown else None, color, turn, shift)
 
 
 def _long_enough(profile, brush):
