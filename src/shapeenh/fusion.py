@@ -30,7 +30,8 @@ def unknown_truth(*arrays):
 def stored(always, function, *args):
     """`function(*args)`, evaluated once and stored.
 
-    `always` is a predicate that is true at run time but unknown at compile time, such as `unknown_truth`'s.
+    `always` is a predicate that is true at run time but unknown at compile time, such as `unknown_truth`'s. A border
+    next to another one needs its own: under the same predicate XLA makes one branch of both, and fuses within it.
     """
     shapes = jax.eval_shape(function, *args)
 

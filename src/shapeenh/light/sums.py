@@ -276,6 +276,7 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
     table = _light_table(direction, radiance, ladder(direction.shape[0], plan.chunk))
     group = _group(plan, mask)
     on = walk.total >= 0
+    then = walk.ids[0] >= 0  # for the borders that follow one on `on`: see `stored`
     lane = lax.iota(jnp.int32, group)
     moved = {plane for name, reached in plan.reach if name in wanted for plane in reached}
     names = kernel.planes_of(plan.model)
@@ -303,7 +304,6 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
 
         def body(carry, numbers, rows):
             planes_bar, light_bar = carry
-            light, _ = _unpack(rows)
             known, weight = _weights(plan.model, on, planes, rows)
 
             def derivatives(planes, rows, known, weight):
@@ -313,18 +313,23 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
                 bar, w_bar = kernel.adjoint(plan.model, form, light, weight, along)
                 return {name: bar[name] for name in used}, w_bar
 
+            def added(planes_bar, forms_bar, rows):
+                # The planes of a form together: one kernel, and one that is large enough for XLA to share among cores.
+                light, _ = _unpack(rows)
+                factors = {
+                    form: jnp.stack([light[coefficient][..., 0] for _, coefficient in of_form], axis=-1)
+                    for form, of_form in reached.items()
+                }
+                return {form: _add_weighted(planes_bar[form], forms_bar[form], factors[form]) for form in reached}
+
             if used:
                 forms_bar, w_bar = stored(on, derivatives, planes, rows, known, weight)
-                # The planes of a form together: one kernel, and one that is large enough for XLA to share among cores.
-                for form, of_form in reached.items():
-                    factors = jnp.stack([light[coefficient][..., 0] for _, coefficient in of_form], axis=-1)
-                    planes_bar = planes_bar | {form: _add_weighted(planes_bar[form], forms_bar[form], factors)}
+                planes_bar = stored(then, added, planes_bar, {form: forms_bar[form] for form in reached}, rows)
             light_bar = dict(light_bar)
             if "radiance" in wanted:
-                lanes = stored(on, lambda weight: _products(weight, sums_bar), weight)
-                light_bar["radiance"] = (
-                    light_bar["radiance"].at[numbers].add(jnp.sum(lanes, axis=-1), mode="promise_in_bounds")
-                )
+                lanes = stored(then, _products, weight, sums_bar)
+                colour_bar = stored(on, lambda lanes: sum(lanes[..., i] for i in range(blocks.SIDE)), lanes)
+                light_bar["radiance"] = light_bar["radiance"].at[numbers].add(colour_bar, mode="promise_in_bounds")
             if "direction" in wanted:
                 columns = {name: jnp.zeros(numbers.shape, planes.dtype) for name in kernel.COEFFICIENTS}
                 columns["w"] = blocks.sum_pixels(w_bar)
