@@ -1,18 +1,22 @@
 """Faces sorted into size classes without sorting.
 
-Every face gets a class: 0 = nothing to draw (culled, off the image, without area, or between pixel centres), k = its
-pixel centres fit the window WINDOWS[k - 1], MEDIUM = larger, LARGE = too long for 32 bits, or cut by the near plane.
+Every face gets a class: 0 = nothing to draw (culled, off the image, without area, or, if small, without a pixel centre
+in it), k = its pixel centres fit the window WINDOWS[k - 1], MEDIUM = larger, LARGE = too long for 32 bits, or cut by
+the near plane.
 Faces of a class are then *listed*, in ascending order, by bit words and counts of their bits: several times faster
 than a sort, without a capacity that could overflow.
 """
 
 from __future__ import annotations
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from shapeenh.buffers.project import BEHIND, double_area, faces_viewer, pixel_box, three
+from shapeenh.buffers.project import BEHIND, SUB, double_area, faces_viewer, pixel_box, three
+from shapeenh.buffers.windows import edge_functions
 from shapeenh.buffers.xla import take
 from shapeenh.fusion import stored
 
@@ -39,6 +43,14 @@ def touches(box, cells, side, height, width):
     return inside + take(table, top + left) > 0
 
 
+def covers_pixel(x, y):
+    """Whether a face with corners x, y, three [n] each, covers one of the first 2 x 2 pixel centres."""
+    a, b, c = edge_functions(x, y)
+    right, below, both = ([c[k] + step[k] for k in range(3)] for step in (a, b, [a[k] + b[k] for k in range(3)]))
+    inside = [three(jnp.minimum, e) for e in (c, right, below, both)]
+    return functools.reduce(jnp.maximum, inside) >= 0
+
+
 def classify(x, y, height, width, cull, cells=None, side=1):
     """Class [F] uint8 of faces with snapped corners x, y [3, F]; with `cells`, only of those that touch one."""
     x0, x1, y0, y1 = box = pixel_box(x, y, height, width)
@@ -51,6 +63,7 @@ def classify(x, y, height, width, cull, cells=None, side=1):
     drawn = jnp.where(faces_viewer(double_area(x, y), cull), kind, 0)
     kind = jnp.where(extent >= LONG, LARGE, drawn)
     kind = jnp.where((columns > 0) & (rows > 0), kind, 0)
+    kind = jnp.where((kind == 1) & ~covers_pixel([t - (x0 << SUB) for t in x], [t - (y0 << SUB) for t in y]), 0, kind)
     if cells is not None:
         kind = jnp.where(touches(box, cells, side, height, width), kind, 0)
     cut = jnp.where(low_x == BEHIND, 0, LARGE)
@@ -123,22 +136,23 @@ def list_faces(always, words, ends, count, room):
     bit = np.arange(32, dtype=np.uint32)[None, :, None]
     before = (np.uint32(1) << bit) - np.uint32(1)
 
-    def step(i, faces):
-        def places(words, ends):
-            of_block = [
-                lax.dynamic_slice(t, (jnp.int32(0), i * (size // 32)), (LARGE, size // 32)) for t in (words, ends)
-            ]
-            words, ends = (t.reshape(LARGE, -1, 1, LANES) for t in of_block)
-            place = jnp.full((size // (32 * LANES), 32, LANES), count + room - 1, jnp.int32)
-            for k in range(LARGE):
-                later = lax.population_count(words[k] & ~before).astype(jnp.int32)  # this face and those after it
-                place = jnp.where((words[k] >> bit) & 1 > 0, begins[k] + ends[k] - later, place)
-            return place.reshape(-1)
+    def places(words, ends):
+        words, ends = (t.reshape(LARGE, -1, 1, LANES) for t in (words, ends))
+        word, end = jnp.zeros_like(words[0]), jnp.zeros_like(ends[0])  # those of the face's class
+        for k in range(LARGE):
+            of_class = (words[k] >> bit) & 1 > 0
+            word, end = jnp.where(of_class, words[k], word), jnp.where(of_class, ends[k], end)
+        later = lax.population_count(word & ~before).astype(jnp.int32)  # this face and those after it
+        return jnp.where(word > 0, end - later, count + room - 1)
 
-        place = stored(always, places, words, ends)
+    def step(i, faces):
+        # sliced out here: LLVM does not vectorise what reads from a place that is known at run time only
+        of_block = [lax.dynamic_slice(t, (jnp.int32(0), i * (size // 32)), (LARGE, size // 32)) for t in (words, ends)]
+        place = stored(always, places, *of_block).reshape(-1)
         face = block_start(i, count) + lax.iota(jnp.int32, size)
         return faces.at[place].set(face, mode="promise_in_bounds", wrap_negative_indices=False)
 
+    ends = ends + begins[:, None]
     faces = lax.fori_loop(jnp.int32(0), jnp.int32(blocks), step, jnp.zeros((count + room,), jnp.int32))
     return faces, begins
 

@@ -20,10 +20,10 @@ from shapeenh.buffers.inputs import check_camera, check_mesh
 from shapeenh.buffers.project import SUB, clip_matrix, nearness, nearness_shift, project
 from shapeenh.buffers.tiles import FACES, TILE, draw_tiles, tile_count
 from shapeenh.buffers.windows import (
+    NEVER,
     WINDOW,
     edge_functions,
     merge,
-    merge_pixels,
     move_window,
     nearness_plane,
     pixel_keys,
@@ -37,6 +37,7 @@ from shapeenh.types import Camera, Mesh, Visibility
 CHUNK = 8192  # faces per step
 SLOTS = 65536  # candidate pixels per step
 PAIRS = 2048  # (face, window) pairs per step: small kernels run on one core, so few of them
+PART = 512  # pairs merged at a time: their keys stay in cache, and are made while those before are merged
 BORDER = max(TILE, WINDOW, *(k for window in WINDOWS for k in window))  # windows may hang over the right and lower edge
 NO_PAIR = np.int32(2**31 - 1)
 CULL = {False: "none", None: "none", "none": "none", True: "back", "back": "back", "front": "front"}
@@ -114,13 +115,11 @@ def draw(vertices, faces, m, near, height, width, cull, cells, side):
         listed, begins = list_faces(always, words, ends, count, chunk)
         steps = jnp.cumsum((totals + (chunk - 1)) // chunk, dtype=jnp.int32)  # of all classes up to this one
 
-        def step(state):
-            """The next chunk of faces of one class: fetched, drawn."""
-            i, keys = state
+        def fetched(i):
+            """Chunk i: class, faces [n], how many of them there are, corner indices in the faces' and in ascending
+            order, and corners x, y, nearness, three [3, n]."""
             row = jnp.sum(i >= steps, dtype=jnp.int32)
             first_rank = (i - jnp.where(row > 0, steps[row - 1], 0)) * chunk
-            rank = first_rank + lax.iota(jnp.int32, chunk)
-            total = totals[row]
 
             def fetch(index, plane):
                 return take(flat_corners, index.reshape(-1) + np.int32(plane * vertices.shape[0]))
@@ -129,64 +128,104 @@ def draw(vertices, faces, m, near, height, width, cull, cells, side):
             own = stored(always, corner_indices, flat_faces, face)
             index = stored(always, ascending, own)
             xyr = [stored(always, functools.partial(fetch, plane=k), index).reshape(index.shape) for k in range(3)]
-            there = jnp.minimum(total - first_rank, chunk)
+            return row, face, jnp.minimum(totals[row] - first_rank, chunk), own, index, xyr
+
+        def draw_narrow(i, keys):
+            _, face, there, _, _, xyr = fetched(i)
+            valid = lax.iota(jnp.int32, chunk) < there
+            return draw_pixels(always, keys, face, xyr, valid, shift, height, width)
+
+        def draw_wide(i, keys):
+            row, face, there, own, index, xyr = fetched(i)
+            valid = lax.iota(jnp.int32, chunk) < there
             # one loop per class, of which all but one take no step: unlike a conditional, a loop updates in place
-            sizes = [jnp.where(row == k, there, 0) for k in range(LARGE)]
-            keys = draw_windows(always, keys, face, xyr, rank < total, shift, sizes[:-1], height, width)
+            sizes = [jnp.where(row == k, there, 0) for k in range(1, LARGE)]
+            keys = draw_windows(always, keys, face, xyr, valid, shift, sizes[:-1], height, width)
 
             part = max(1, min(chunk // 2, FACES, (2**31 - 1) // tile_count(height, width)))  # so that counts fit int32
 
             def draw_large(j, keys):
-                some, order, corner, valid, *at = cut(j * part, part, face, own, index, rank < total, *xyr)
+                some, order, corner, some_valid, *at = cut(j * part, part, face, own, index, valid, *xyr)
                 image = {"height": height, "width": width, "cull": cull, "stride": stride}
-                return draw_tiles(keys, vertices, some, corner, at, ascends(order), valid, m, near, shift, **image)
+                return draw_tiles(keys, vertices, some, corner, at, ascends(order), some_valid, m, near, shift, **image)
 
-            keys = lax.fori_loop(jnp.int32(0), (sizes[-1] + (part - 1)) // part, draw_large, keys)
-            return i + 1, keys
+            return lax.fori_loop(jnp.int32(0), (sizes[-1] + (part - 1)) // part, draw_large, keys)
 
         keys = jnp.zeros(((height + BORDER) * stride,), jnp.uint64)
-        keys = lax.while_loop(lambda state: state[0] < steps[-1], step, (jnp.int32(0), keys))[1]
-        keys = keys.reshape(height + BORDER, stride)[:height, :width]
-        face = lax.bitcast_convert_type(~lax.convert_element_type(keys, jnp.uint32), jnp.int32)
-        return jnp.where(keys == 0, jnp.int32(-1), face)
+        keys = lax.fori_loop(jnp.int32(0), steps[0], draw_narrow, keys)
+        keys = lax.fori_loop(steps[0], steps[-1], draw_wide, keys)
+        return faces_of(keys.reshape(-1, stride)[:height, :width])
+
+
+def faces_of(keys):
+    """The faces whose keys won, -1 where there is none."""
+    face = lax.bitcast_convert_type(~lax.convert_element_type(keys, jnp.uint32), jnp.int32)
+    return jnp.where(keys == 0, jnp.int32(-1), face)
 
 
 def cut(start, size, *tables):
     return [lax.dynamic_slice_in_dim(t, start, size, -1) for t in tables]
 
 
+def in_window(xyr, height, width):
+    """x and y of corners [3, n], three [n] each, relative to the first pixel of their window."""
+    x0, y0, _, _ = window_box(xyr[0], xyr[1], height, width)
+    return [t - (x0 << SUB) for t in xyr[0]], [t - (y0 << SUB) for t in xyr[1]]
+
+
+def draw_pixels(always, keys, face, xyr, valid, shift, height, width):
+    """Faces [n] of the first class into the keys."""
+    (rows, columns), stride = WINDOWS[0], width + BORDER
+
+    def new_keys(face, xyr, valid, shift):
+        x, y = in_window(xyr, height, width)
+        return pixel_keys(x, y, nearness(xyr[2]) - shift, ~face.astype(jnp.uint32), valid, rows, columns)
+
+    def pixels(xyr):
+        x0, y0, _, _ = window_box(xyr[0], xyr[1], height, width)
+        offset = np.add.outer(np.arange(rows) * stride, np.arange(columns)).astype(np.int32)
+        return (y0 * stride + x0)[None] + offset.reshape(-1, 1)
+
+    new, at = stored(always, new_keys, face, xyr, valid, shift), stored(always, pixels, xyr)
+    return keys.at[at.reshape(-1)].max(new.reshape(-1), mode="promise_in_bounds", wrap_negative_indices=False)
+
+
 def draw_windows(always, keys, face, xyr, valid, shift, sizes, height, width):
-    """The first `sizes[k]` of the faces [n], as faces of class k + 1, into the keys."""
-    stride = width + BORDER
+    """The first `sizes[k]` of the faces [n], as faces of class k + 2, into the keys."""
+    low, stride = ~face.astype(jnp.uint32), width + BORDER
 
-    def setup(xyr, valid):
+    def boxes(xyr):
         x0, y0, columns, rows = window_box(xyr[0], xyr[1], height, width)
-        x, y = xyr[0] - (x0 << SUB)[None], xyr[1] - (y0 << SUB)[None]
-        edges = edge_functions(x, y, valid).reshape(9, -1).astype(jnp.float32)
-        planes = jnp.concatenate([edges, nearness_plane(x, y, nearness(xyr[2]) - shift)])
-        return planes, jnp.stack([y0 * stride + x0, columns, rows])
+        return jnp.stack([y0 * stride + x0, columns, rows])
 
-    planes, box = stored(always, setup, xyr, valid)
-    low, first = ~face.astype(jnp.uint32), box[0]
-    for (rows, columns), size in zip(WINDOWS, sizes[:-1], strict=True):
+    def edge_planes(xyr, valid):
+        a, b, c = edge_functions(*in_window(xyr, height, width))
+        return jnp.stack([*a, *b, *(jnp.where(valid, t, NEVER) for t in c)]).astype(jnp.float32)
+
+    def nearness_planes(xyr, shift):
+        x, y = in_window(xyr, height, width)
+        return jnp.stack(nearness_plane(x, y, nearness(xyr[2]) - shift))
+
+    box, edges = stored(always, boxes, xyr), stored(always, edge_planes, xyr, valid)
+    plane = stored(always, nearness_planes, xyr, shift)
+    for (rows, columns), size in zip(WINDOWS[1:], sizes[:-1], strict=True):
         part = min(face.shape[0], SLOTS // (rows * columns))
-        make_keys, put = (pixel_keys, merge_pixels) if rows * columns <= 4 else (window_keys, merge)
 
-        def draw_part(j, keys, rows=rows, columns=columns, part=part, make_keys=make_keys, put=put):
-            some, name, start = stored(always, lambda *t: cut(j * part, part, *t), planes, low, first)
+        def draw_part(j, keys, rows=rows, columns=columns, part=part):
+            some = stored(always, lambda *t: cut(j * part, part, *t), edges, plane, low)
 
-            def new_keys(planes, low):
-                return make_keys(planes[:9].reshape(3, 3, -1), planes[9:], low, rows, columns)
+            def new_keys(edges, plane, low):
+                return window_keys(edges.reshape(3, 3, -1), plane, low, rows, columns)
 
-            return put(keys, stored(always, new_keys, some, name), start, stride)
+            return merge(keys, stored(always, new_keys, *some), cut(j * part, part, box[0])[0], stride)
 
         keys = lax.fori_loop(jnp.int32(0), (size + (part - 1)) // part, draw_part, keys)
-    return draw_medium(always, keys, planes, low, box, sizes[-1], stride)
+    return draw_medium(always, keys, edges, plane, low, box, sizes[-1], stride)
 
 
-def draw_medium(always, keys, planes, low, box, size, stride):
+def draw_medium(always, keys, edges, plane, low, box, size, stride):
     """The first `size` of the faces, window by window of WINDOW x WINDOW pixels: as many as their boxes need."""
-    n = planes.shape[1]
+    n = edges.shape[1]
 
     def listed(box):
         windows = jnp.where(lax.iota(jnp.int32, n) < size, box[1] * box[2], 0)
@@ -196,7 +235,6 @@ def draw_medium(always, keys, planes, low, box, size, stride):
 
     ends, begins = stored(size > 0, listed, box)  # of chunks of other classes, nothing
     total = ends[-1]
-    flat, row_start = planes.reshape(-1), np.arange(planes.shape[0], dtype=np.int32)[:, None] * n
 
     def step(j, keys):
         def find(ends, begins, box):
@@ -211,13 +249,18 @@ def draw_medium(always, keys, planes, low, box, size, stride):
             return at, number - row * take(box[1], at), row, pair < total
 
         at, column, row, there = stored(always, find, ends, begins, box)
-        local = stored(always, lambda at, flat: take(flat, at[None] + row_start), at, flat)
 
-        def moved(local, column, row, there):
-            return move_window(local, column * WINDOW, row * WINDOW, there)
+        def of_faces(planes, at):
+            return take(planes.reshape(-1), at[None] + np.arange(planes.shape[0], dtype=np.int32)[:, None] * n)
 
-        edges, plane = stored(always, moved, local, column, row, there)
+        local = [stored(always, of_faces, t, at) for t in (edges, plane)]
+        moved, moved_plane = stored(always, move_window, *local, column * WINDOW, row * WINDOW, there)
         start = take(box[0], at) + (row * stride + column) * WINDOW
-        return merge(keys, window_keys(edges, plane, take(low, at), WINDOW, WINDOW), start, stride)
+        low_here = take(low, at)
+        for k in range(0, PAIRS, PART):
+            some = slice(k, k + PART)
+            new = window_keys(moved[..., some], moved_plane[:, some], low_here[some], WINDOW, WINDOW)
+            keys = merge(keys, new, start[some], stride)
+        return keys
 
     return lax.fori_loop(jnp.int32(0), (total + (PAIRS - 1)) // PAIRS, step, keys)

@@ -12,7 +12,7 @@ from jax import lax
 
 from shapeenh.buffers.project import ONE, SUB, double_area, pixel_box, three, top_left
 
-FROM, TO = np.array([1, 2, 0]), np.array([2, 0, 1])  # the edge opposite to corner 0, 1, 2
+OPPOSITE = ((1, 2), (2, 0), (0, 1))  # the edge opposite to corner 0, 1, 2
 WINDOW = 8  # pixels each way, of faces that need more than one window
 NEVER = np.int32(-(1 << 30))  # an edge function that no pixel of a window makes positive
 
@@ -33,39 +33,39 @@ def window_box(x, y, height, width):
     return jnp.clip(x0, 0, width - 1), jnp.clip(y0, 0, height - 1), columns, rows
 
 
-def move_window(planes, dx, dy, there):
-    """Edge functions [3, 3, n] and nearness plane [5, n] from `planes` [14, n], seen from a window that begins dx
-    columns and dy rows further on; nothing is inside where not `there`. Still exact in float32."""
+def move_window(edges, plane, dx, dy, there):
+    """Edge functions [3, 3, n] and nearness plane [5, n] of `edges` [9, n] and `plane`, seen from a window that begins
+    dx columns and dy rows further on; nothing is inside where not `there`. Still exact in float32."""
     dx, dy = lax.convert_element_type(dx, jnp.float32), lax.convert_element_type(dy, jnp.float32)
-    a, b, c = planes[:3], planes[3:6], planes[6:9]
+    a, b, c = edges[:3], edges[3:6], edges[6:]
     c = jnp.where(there[None], a * dx[None] + b * dy[None] + c, np.float32(NEVER))
-    base = planes[9] + planes[10] * dx + planes[11] * dy
-    return jnp.stack([a, b, c]), jnp.concatenate([base[None], planes[10:]])
+    base = plane[0] + plane[1] * dx + plane[2] * dy
+    return jnp.stack([a, b, c]), jnp.concatenate([base[None], plane[1:]])
 
 
-def edge_functions(x, y, valid):
-    """Integers [3, 3, n]: a, b, c of three edges, for corners x, y [3, n] relative to the window's first pixel.
+def edge_functions(x, y):
+    """Integers a, b, c of three edges each, for corners x, y, three [n] each, relative to the window's first pixel.
 
     Inside is a dx + b dy + c >= 0 for every edge, dx and dy counted in pixels: c = floor((c' - bias)/256) with the
     top-left rule as bias. Exact, and exact in float32 too (below 2^24), as long as the face is shorter than LONG.
     """
-    sign = jnp.where(double_area(x, y) < 0, -1, 1)[None]
-    a, b = (y[FROM] - y[TO]) * sign, (x[TO] - x[FROM]) * sign
-    c = -(a * x[FROM] + b * y[FROM])
-    c = (c - jnp.where(top_left(a, b), 0, 1)) >> SUB
-    return jnp.stack([a, b, jnp.where(valid[None], c, NEVER)])
+    sign = jnp.where(double_area(x, y) < 0, -1, 1)
+    a = [(y[j] - y[k]) * sign for j, k in OPPOSITE]
+    b = [(x[k] - x[j]) * sign for j, k in OPPOSITE]
+    c = [-(a[i] * x[j] + b[i] * y[j]) for i, (j, _) in enumerate(OPPOSITE)]
+    return a, b, [(c[i] - jnp.where(top_left(a[i], b[i]), 0, 1)) >> SUB for i in range(3)]
 
 
 def nearness_plane(x, y, r):
-    """Float32 [5, n]: nearness at the first pixel, its steps in x and y, and its least and greatest value."""
+    """Float32, five [n]: nearness at the first pixel, its steps in x and y, and its least and greatest value."""
     area = double_area(x, y)
-    x, y = lax.convert_element_type(x, jnp.float32), lax.convert_element_type(y, jnp.float32)
+    x, y = ([lax.convert_element_type(t, jnp.float32) for t in xs] for xs in (x, y))
     inverse = 1 / lax.convert_element_type(jnp.where(area == 0, 1, area), jnp.float32)
     d1, d2 = r[1] - r[0], r[2] - r[0]
     gx = (d1 * (y[2] - y[0]) - d2 * (y[1] - y[0])) * inverse
     gy = (d2 * (x[1] - x[0]) - d1 * (x[2] - x[0])) * inverse
     base = r[0] - gx * x[0] - gy * y[0]
-    return jnp.stack([base, gx * ONE, gy * ONE, three(jnp.minimum, r), three(jnp.maximum, r)])
+    return base, gx * ONE, gy * ONE, three(jnp.minimum, r), three(jnp.maximum, r)
 
 
 def window_keys(edges, plane, low, rows, columns):
@@ -100,22 +100,14 @@ def merge(keys, new, first, stride):
     return lax.scatter_max(keys, at, new.reshape(-1, columns), numbers, mode=mode)
 
 
-def pixel_keys(edges, plane, low, rows, columns):
-    """The same keys as [rows, columns, n], for a window too narrow to be worth a SIMD lane per pixel: a lane per face
-    instead."""
-    a, b, c = edges
-    keys = []
-    for row in range(rows):
-        for column in range(columns):
-            dx, dy = edges.dtype.type(column), edges.dtype.type(row)
-            inside = three(jnp.minimum, [a[k] * dx + b[k] * dy + c[k] for k in range(3)]) >= 0
-            r = plane[0] + plane[1] * np.float32(column) + plane[2] * np.float32(row)
-            keys.append(pack(inside, jnp.maximum(jnp.minimum(r, plane[4]), plane[3]), low))
-    return jnp.stack(keys).reshape(rows, columns, -1)
-
-
-def merge_pixels(keys, new, first, stride):
-    """keys [n] with the pixels `new` [rows, columns, m] of windows whose first pixel is `first` [m]."""
-    rows, columns, _ = new.shape
-    at = first[None, None] + np.add.outer(np.arange(rows) * stride, np.arange(columns)).astype(np.int32)[:, :, None]
-    return keys.at[at.reshape(-1)].max(new.reshape(-1), mode="promise_in_bounds", wrap_negative_indices=False)
+def pixel_keys(x, y, r, low, valid, rows, columns):
+    """Keys [rows * columns, n] of faces with corners x, y, r, three [n] each, for a window too narrow to be worth a
+    SIMD lane per pixel: a lane per face instead, and one kernel from corners to keys."""
+    pixel = np.arange(rows * columns, dtype=np.int32)[:, None]
+    dx, dy = pixel % columns, pixel // columns
+    x, y, r = ([t[None] for t in corner] for corner in (x, y, r))
+    a, b, c = edge_functions(x, y)
+    inside = valid[None] & (three(jnp.minimum, [a[k] * dx + b[k] * dy + c[k] for k in range(3)]) >= 0)
+    base, gx, gy, lowest, highest = nearness_plane(x, y, r)
+    r = base + gx * dx.astype(np.float32) + gy * dy.astype(np.float32)
+    return pack(inside, jnp.maximum(jnp.minimum(r, highest), lowest), low[None])
