@@ -22,14 +22,14 @@ from tests.reference import diffusion as reference
 
 import shapeenh as se
 from benchmarks.harness import data, measure, pareto, table, write
-from shapeenh.descriptor.diffusion import diffuse_stacks, flank, levels_for
+from shapeenh.descriptor.diffusion import diffuse_stacks, flank, levels_for, most_links
 from shapeenh.stencils import links
 
 
 @partial(jax.jit, static_argnames=("levels", "flanks"))
 def run(u, c, time, levels, flanks=False):
     marks = flank(c) if flanks else None
-    return diffuse_stacks((u,), *links(c), time, c > 0, marks, time[0, 0] < 1e9, levels, True)[0]
+    return diffuse_stacks((u,), c, links(c), time, marks, time[0, 0] < 1e9, levels, True, most_links(c.size, False))[0]
 
 
 def scenes(height, width):

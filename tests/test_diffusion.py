@@ -11,7 +11,7 @@ from jax.test_util import check_grads
 from shapeenh import heat
 from shapeenh.descriptor.diffusion import diffuse_stacks, flank, levels_for
 from shapeenh.numerics import smoothstep
-from shapeenh.sparse import few_links
+from shapeenh.sparse import FewLinks, at, places_of
 from shapeenh.stencils import links
 from tests.reference import diffusion as reference
 
@@ -22,7 +22,7 @@ SCHEMES = ("explicit", "fast")
 @partial(jax.jit, static_argnames=("levels", "sure"))
 def _run(u, c, budget, levels, sure):
     always = budget[0, 0] < 1e9
-    return diffuse_stacks((u,), *links(c), budget, c > 0, None, always, levels, sure)[0]
+    return diffuse_stacks((u,), c, links(c), budget, None, always, levels, sure)[0]
 
 
 def diffuse(u, c, sigma, scheme="explicit"):
@@ -189,16 +189,18 @@ def test_a_few_links_get_the_derivative_that_all_would_give_them(x64, rng, budge
     flags = [jnp.asarray(rng.random((6, 7)) < 0.2) for _ in "xy"]
     flags = flags[0].at[:, -1].set(False), flags[1].at[-1].set(False)
 
+    places = places_of(flags, 20)
+
     def by_few(u, x, y, b):
-        few = few_links(x, y, flags, 20)
+        whole = jnp.pad(x, ((0, 0), (0, 1))), jnp.pad(y, ((0, 1), (0, 0)))
+        few = FewLinks(tuple(map(at, whole, places)), places)
         x, y = jax.lax.stop_gradient((x, y))
         return jnp.vdot(ct, heat.explicit(u, x, y, b, one, few, 0.2, (3, 3, 2)))
 
     def by_all(u, x, y, b):
         return jnp.vdot(ct, heat.explicit(u, x, y, b, one, None, 0.2, (3, 3, 2)))
 
-    at = (u, *links(c), b)
-    few, whole = (jax.jit(jax.grad(f, (0, 1, 2, 3)))(*at) for f in (by_few, by_all))
+    few, whole = (jax.jit(jax.grad(f, (0, 1, 2, 3)))(u, *links(c), b) for f in (by_few, by_all))
     for found, wanted, where in zip(few, whole, (True, flags[0][:, :-1], flags[1][:-1], True), strict=True):
         np.testing.assert_allclose(found, np.where(where, wanted, 0), atol=1e-13)
     assert np.abs(few[1]).max() > 0
@@ -218,7 +220,7 @@ def test_derivative_through_flanks(x64, rng, levels, much):
     def run(u, x, time, marked):
         c = jnp.where(alive, smoothstep(0.0, 1.0, x), 0)
         marks = flank(c) if marked else None
-        return jnp.vdot(ct, diffuse_stacks((u,), *links(c), time, alive, marks, always, levels, True)[0])
+        return jnp.vdot(ct, diffuse_stacks((u,), c, links(c), time, marks, always, levels, True, 256)[0])
 
     count = max(int(jnp.sum(marks)) for marks in flank(smoothstep(0.0, 1.0, x)))
     assert (count > 256) == much

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shapeenh.numerics import smoothstep
-from shapeenh.sparse import few_links, pull_near
+from shapeenh.sparse import at_ends, jumps_at, places_of, pull_near
 from shapeenh.stencils import derivatives, derivatives_beside, links, shift
 
 SHAPE = (70, 90)
@@ -33,17 +33,21 @@ def test_pulling_near_flags(x64, rng, shape, share):
     assert np.all((far == 0) | (np.abs(far - np.asarray(wanted)[~near]) < 1e-14))
 
 
-def test_the_places_of_a_few_links(rng):
-    link_x, link_y = (jnp.asarray(rng.random(shape), jnp.float32) for shape in ((9, 10), (8, 11)))
+def test_the_places_and_the_ends_of_a_few_links(rng):
+    image = jnp.asarray(rng.random((9, 11)), jnp.float32)
     flags = rng.random((2, 9, 11)) < 0.2
     flags[0, :, -1] = flags[1, -1] = False
-    few = few_links(link_x, link_y, tuple(map(jnp.asarray, flags)), 40)
-    for place, value, flag, link in zip(few.places, few.values, flags, (link_x, link_y), strict=True):
+    places = places_of(tuple(map(jnp.asarray, flags)), 40)
+    for place, (begin, end), jump, flag, axis in zip(
+        places, at_ends(image, places), jumps_at(image[None], places), flags, (1, 0), strict=True
+    ):
         n = flag.sum()
         np.testing.assert_array_equal(place[:n], np.flatnonzero(flag))
         assert np.all(place[n:] == 9 * 11 - 1)
-        assert np.all(value[n:] == 0)
-        np.testing.assert_array_equal(value[:n], np.asarray(link)[np.nonzero(flag)])
+        np.testing.assert_array_equal(begin[:n], np.asarray(image)[np.nonzero(flag)])
+        np.testing.assert_array_equal(end[:n], np.roll(image, -1, axis)[np.nonzero(flag)])
+        np.testing.assert_array_equal(jump[0], end - begin)
+        assert np.all(jump[0, n:] == 0)
 
 
 def test_derivatives_beside_flanks(x64, rng):

@@ -71,8 +71,8 @@ def explicit(planes, link_x, link_y, budget, weight, few=None, step=STEP, slots=
 
     planes: [C, H, W]; link_x: [H, W-1]; link_y: [H-1, W]; budget: [1, 1] or [H, W], time in px^2, sigma = sqrt(2 time).
     weight: [1, 1] or [H, W], what a pixel makes of one unit of inflow (1, or 1/volume); no gradient.
-    few: None, or the links that alone have a derivative, from `few_links`, where it arrives: `link_x` and `link_y`
-        are to be constants then.
+    few: None, or the links that alone have a derivative, and where it arrives: `link_x` and `link_y` are to be
+        constants then.
     *Static*: step, the longest step; slots, how many states the reverse sweep keeps per level, coarsest first: the
         number of steps that can be differentiated with respect to links is at most REPLAYED times their product.
     The number of steps is read at run time, so nothing recompiles when the budget changes; the last step is as
@@ -128,11 +128,11 @@ def _forward_with_jumps(stop, g, fixed, step, places, most: int):
 
     def one(k, carry):
         kept, g = carry
-        return keep(kept, g, k), _step(k, g, divergence(g, *fixed[:2]), fixed, step)
+        g = _step(k, g, divergence(g, *fixed[:2]), fixed, step)
+        return keep(kept, g, k + 1), g  # of the new g: the old one is overwritten
 
     kept = [jnp.zeros((most + 1, g.shape[0], place.size), g.dtype) for place in places]
-    kept, g = lax.fori_loop(0, stop, one, (kept, g))
-    return keep(kept, g, stop), g
+    return lax.fori_loop(0, stop, one, (keep(kept, g, 0), g))
 
 
 def _forward_with_rate(planes, fixed, step):
@@ -170,7 +170,7 @@ def _explicit_bwd(step, slots, saved, lam):
         jumps_of_g = lambda k: [lax.dynamic_index_in_dim(jumps, k, 0, False) for jumps in kept]  # noqa: E731
         jumps = jumps_of_g, partial(jumps_at, places=places)
         d_few = tuple(jnp.zeros(place.shape, lam.dtype) for place in places)
-        pulled, d_few, d_budget = _sweep(0, count, (pulled, d_few, d_budget), fixed, rate, step, jumps)
+        pulled, d_few, d_budget = _sweep(0, count, (pulled, d_few, d_budget), fixed, rate, step, jumps, ahead=uniform)
     else:
         pulled, _, d_budget = _sweep(0, count, (pulled, None, d_budget), fixed, rate, step, None)
     if uniform:
@@ -180,23 +180,28 @@ def _explicit_bwd(step, slots, saved, lam):
     return pulled, *(sums or (None, None)), d_budget, None, few
 
 
-def _sweep(start, count, carry, fixed, rate, step, jumps):
+def _sweep(start, count, carry, fixed, rate, step, jumps, ahead=False):
     """Pull `carry` (cotangent, sums of derivatives with respect to links, d_budget) back through steps, the last first.
 
     jumps: step -> the jumps of g before it, and planes -> their jumps; or None, and there are no sums.
+    ahead: those of the cotangent are taken from the new one, for the next step, so that the old one can be overwritten;
+        with one budget for all.
     """
+
+    uniform = fixed[2].shape == (1, 1)
 
     def back(j, carry):
         k = start + count - 1 - j
-        pulled, sums, d_budget = carry
+        (pulled, sums, d_budget), across = carry
         pulled, d_budget, factor = _pull(k, pulled, d_budget, fixed, rate, step)
         if jumps is not None:
-            share = _share(fixed[2][0, 0], k, step) if fixed[2].shape == (1, 1) else 1
-            products = [_over_channels(a * b) for a, b in zip(jumps[0](k), jumps[1](factor), strict=True)]
+            share = _share(fixed[2][0, 0], k, step) if uniform else 1
+            across = across if ahead else jumps[1](factor)
+            products = [_over_channels(a * b) for a, b in zip(jumps[0](k), across, strict=True)]
             sums = tuple(total - share * product for total, product in zip(sums, products, strict=True))
-        return pulled, sums, d_budget
+        return (pulled, sums, d_budget), jumps[1](pulled) if ahead else None
 
-    return lax.fori_loop(0, count, back, carry)
+    return lax.fori_loop(0, count, back, (carry, jumps[1](carry[0]) if ahead else None))[0]
 
 
 def _pull(k, pulled, d_budget, fixed, rate, step):

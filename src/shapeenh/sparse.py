@@ -35,20 +35,13 @@ class FewLinks(NamedTuple):
     places: tuple
 
 
-def few_links(link_x, link_y, flags, most: int):
-    """The first `most` flagged links along x and along y.
+def places_of(flags, most: int):
+    """Where the first `most` flagged links along x and along y begin, filled up with the last pixel, where none does.
 
-    link_x: [H, W-1]; link_y: [H-1, W]; flags: for either direction [H, W], where links begin; the last column of the
-        ones and the last row of the others are not set.
-    Gradient: with respect to the links, through `values`.
+    flags: for either direction [H, W], where links begin; the last column of the ones and the last row of the others
+        are not set.
     """
-
-    def values(link, place):
-        whole = jnp.pad(link, [(0, n - m) for n, m in zip(flags[0].shape, link.shape, strict=True)])
-        return _at(whole.reshape(-1), place)
-
-    places = _listed(flags[0].reshape(-1), most), _listed(flags[1].reshape(-1), most)
-    return FewLinks((values(link_x, places[0]), values(link_y, places[1])), places)
+    return _listed(flags[0].reshape(-1), most), _listed(flags[1].reshape(-1), most)
 
 
 _RUN = 8
@@ -69,15 +62,32 @@ def _listed(flags, most: int):
     return place.astype(jnp.int32)
 
 
-def _at(flat, places):
-    return flat.at[..., places].get(mode="promise_in_bounds")
+def at(planes, place):
+    """Planes [..., H, W] at some pixels, [..., N]."""
+    return planes.reshape(*planes.shape[:-2], -1).at[..., place].get(mode="promise_in_bounds")
+
+
+def at_ends(planes, places):
+    """Planes [..., H, W] where a few links begin and where they end, for either direction; the last pixel is both."""
+    height, width = planes.shape[-2:]
+    last, ends = height * width - 1, zip(places, (1, width), strict=True)
+    return tuple((at(planes, begin), at(planes, jnp.minimum(begin + by, last))) for begin, by in ends)
 
 
 def jumps_at(planes, places):
-    """The differences of planes [C, H, W] across a few links, [C, N]; 0 at the last pixel, where none begins."""
-    flat, last = planes.reshape(planes.shape[0], -1), planes[0].size - 1
-    ends = zip(places, (1, planes.shape[2]), strict=True)
-    return tuple(_at(flat, jnp.minimum(begin + by, last)) - _at(flat, begin) for begin, by in ends)
+    """The differences of planes [C, H, W] across a few links, [C, N]; 0 at the last pixel."""
+    return tuple(end - begin for begin, end in at_ends(planes, places))
+
+
+def put_back(few, border_x, border_y):
+    """The borders with the derivative that a few of them have."""
+    if few is None:
+        return border_x, border_y
+
+    def put(border, value, place):
+        return border.reshape(-1).at[place].add(value - lax.stop_gradient(value)).reshape(border.shape)
+
+    return tuple(map(put, (border_x, border_y), *few))
 
 
 # ------------------------------------------------------------------------------------------- tiles

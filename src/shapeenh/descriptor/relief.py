@@ -81,7 +81,7 @@ def _describe_relief(gbuffer, base, sigma, beta, *, levels, scales):
 
     def intensity(size):
         time = (0.5 * size * size)[None, None]
-        (smooth,) = diffusion.diffuse_stacks((flat,), link_x, link_y, time, c > 0, None, always, levels)
+        (smooth,) = diffusion.diffuse_stacks((flat,), c, (link_x, link_y), time, None, always, levels)
         d_x, d_y = derivatives(smooth, link_x, link_y, always)
         zenzo = jnp.stack(
             [d_x[0] ** 2 + d_x[1] ** 2, d_x[0] * d_y[0] + d_x[1] * d_y[1], d_y[0] ** 2 + d_y[1] ** 2], axis=-1

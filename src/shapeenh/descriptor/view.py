@@ -199,8 +199,8 @@ def _describe_all(gbuffer, sigma, foreshortening, importance, degrees, *, smooth
         budget = _budget(sigma, importance)
         stacks = (g, places)  # of two planes: four at once overflow the cache
         levels, sure, chart = smoothing
-        flank = diffusion.flank(c)
-        g, places = diffusion.diffuse_stacks(stacks, link_x, link_y, budget, c > 0, flank, always, levels, sure)
+        flank, most = diffusion.flank(c), diffusion.most_links(c.size, with_creases)
+        g, places = diffusion.diffuse_stacks(stacks, c, (link_x, link_y), budget, flank, always, levels, sure, most)
         bend = jnp.exp(-8 * jnp.max(budget)) if chart else None  # type: ignore[assignment]
 
     # 7: the Hessian, flat at the singular places
