@@ -442,6 +442,21 @@ def test_a_ray_within_the_plane_of_a_disc_meets_nothing():
     assert np.all(b == 0)
 
 
+def test_where_no_disc_weighs_anything_the_front_one_stands_alone(monkeypatch):
+    monkeypatch.setattr(splat, "SLACK", -0.99)  # as if other rounding missed all but the middle of what was hit before
+    point, normal, color = np.array([0.1, 0.05, 0.2]), np.array([0.2, -0.1, 1.0]), np.array([0.2, 0.5, 0.8])
+    camera = cameras(np.float32)["perspective"]
+    gbuffer = splatted(point, normal, 0.6, camera, width=W + 1, colors=color)  # a shape that is not compiled yet
+    mask, view = np.asarray(gbuffer.mask), np.asarray(camera.view, np.float64)
+    assert mask.sum() > 50
+    n = view[:3, :3] @ normal / np.linalg.norm(normal)
+    away = (np.asarray(gbuffer.position)[mask] - view[:3, :3] @ point - view[:3, 3]) @ n
+    np.testing.assert_allclose(away, 0, atol=1e-5)
+    np.testing.assert_allclose(gbuffer.depth[mask], -gbuffer.position[mask][:, 2], rtol=1e-6)
+    np.testing.assert_allclose(gbuffer.normal[mask], np.broadcast_to(n, (mask.sum(), 3)), atol=1e-5)
+    np.testing.assert_allclose(gbuffer.albedo[mask], np.broadcast_to(color, (mask.sum(), 3)), atol=1e-5)
+
+
 def test_errors(rng):
     camera = cameras(np.float32)["perspective"]
     points, normals, radius, colors = cloud(10, rng)

@@ -14,6 +14,7 @@ from shapeenh.buffers.inputs import check_camera
 from shapeenh.buffers.normals import facing
 from shapeenh.buffers.pairs import from_tiles, pixel_offsets, tile_boxes, to_tiles
 from shapeenh.buffers.splat import (
+    COLOR,
     NORMAL,
     REACH,
     SLACK,
@@ -122,10 +123,17 @@ def _splatted(points, normals, radius, colors, view, projection, tolerance, side
         zero = jnp.zeros((height, width, 3), points.dtype)
         return GBuffer(mask, zero[..., 0], zero, zero, None if colors is None else zero)
 
-    front = to_tiles(front_surface(discs, jnp.where(mask, index, 0)) * mask[..., None])
-    boxes = without_hidden(discs, boxes, front, (height, width))
-    sums = disc_sums(discs, front, near, boxes, (height, width))
-    depth, normal, color = blend(from_tiles(sums, height, width))
+    index = jnp.where(mask, index, 0)
+    front = front_surface(discs, index) * mask[..., None]
+    tiles = to_tiles(front)
+    boxes = without_hidden(discs, boxes, tiles, (height, width))
+    sums = from_tiles(disc_sums(discs, tiles, near, boxes, (height, width)), height, width)
+    depth, normal, color = blend(sums)
+    # Where code that rounds differently has missed even the front disc the second time, that disc stands alone.
+    alone = mask & (sums[..., 0] == 0)
+    depth = jnp.where(alone, front[..., 0], depth)
+    normal = jnp.where(alone[..., None], front[..., 1:4], normal)
+    color = jnp.where(alone[..., None], discs[:, COLOR:][index], color)
     depth = jnp.where(mask, depth, 0)
     normal = facing(jnp.where(mask[..., None], normal, jnp.asarray([0, 0, 1], normal.dtype)))
     position = unproject(projection, window, depth, height, width)
