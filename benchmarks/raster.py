@@ -23,9 +23,10 @@ wants jax < 0.5 and NumPy 1, and cannot be installed beside this package.
 
 What a G-buffer is. Ours: mask, depth, position and normal in camera space, float32, 29 bytes per pixel, in new arrays
 at every call. llvmpipe's: 40 bytes per pixel, in the framebuffer of the frame before, and left there; `llvmpipe read`
-is the same, read into new arrays. Mitsuba's: 28 bytes per pixel. DEODR's: depth and normal in float64, 32 bytes. The
-system hands out new memory page by page, which is a third of our time at 3840x2160. Like for like are therefore ours
-and `llvmpipe read` in the row `G-buffer`, ours and `llvmpipe` in the row `G-buffer, kept memory`.
+is the same and 36 bytes of it read, into new arrays or, in the row `G-buffer, kept memory`, into those of the frame
+before. Mitsuba's: 28 bytes per pixel. DEODR's: depth and normal in float64, 32 bytes. The system hands out new memory
+page by page, which is a third of our time at 3840x2160. Like for like, arrays in the hands of the caller, are
+therefore ours and `llvmpipe read`, in either row; `llvmpipe` alone tells what drawing takes.
 
 `--prototype FOLDER` adds a `rasterizer.py` and a `resolve.py` with `raster_ids` and `gbuffer`.
 """
@@ -85,9 +86,9 @@ def our_calls(mesh: se.Mesh, camera: se.Camera, height: int, width: int) -> dict
     distance = -(mesh.vertices @ camera.view[2, :3] + camera.view[2, 3])[:, None]
 
     @jax.jit
-    def step(vertices, normals, camera):
+    def step(vertices, normals, camera, faces):  # all are arguments: what is closed over would be a constant
         def loss(vertices, normals, camera):
-            g = se.render_gbuffer(se.Mesh(vertices, mesh.faces, normals), camera, **size)
+            g = se.render_gbuffer(se.Mesh(vertices, faces, normals), camera, **size)
             return jnp.sum(g.normal[..., 2] * g.depth) + jnp.sum(g.position[..., 0])
 
         return jax.value_and_grad(loss, (0, 1, 2))(vertices, normals, camera)
@@ -114,7 +115,7 @@ def our_calls(mesh: se.Mesh, camera: se.Camera, height: int, width: int) -> dict
         "barycentrics + depth": of_ids,
         "G-buffer": lambda: se.render_gbuffer(mesh, camera, **size),
         peers.KEPT: kept,
-        "forward + backward": lambda: step(mesh.vertices, mesh.normals, camera),
+        "forward + backward": lambda: step(mesh.vertices, mesh.normals, camera, mesh.faces),
         "G-buffer samples=2": sampled,
     }
     return {f"{row}: {OURS}": call for row, call in calls.items()}

@@ -88,16 +88,24 @@ def llvmpipe(vertices, faces, normals, camera, height, width) -> dict:
 
 
 def llvmpipe_read(vertices, faces, normals, camera, height, width) -> dict:
-    """The same G-buffer read into new arrays, as ours are new arrays at every call."""
+    """The same G-buffer read back: into new arrays, as ours are new arrays at every call, or into those of before."""
     draw = llvmpipe(vertices, faces, normals, camera, height, width)["G-buffer"]
+    kinds = [(4, "f4"), (4, "f4"), (1, "i4")]
 
     def read():
         target = draw()
-        kinds = [(4, "f4"), (4, "f4"), (1, "i4")]
         data = (target.read(components=n, attachment=k, dtype=kind) for k, (n, kind) in enumerate(kinds))
         return [np.frombuffer(d, kind).reshape(height, width, n) for d, (n, kind) in zip(data, kinds, strict=True)]
 
-    return {"G-buffer": read}
+    kept = [np.zeros((height, width, n), kind) for n, kind in kinds]
+
+    def read_over():
+        target = draw()
+        for k, (n, kind) in enumerate(kinds):
+            target.read_into(kept[k], components=n, attachment=k, dtype=kind)
+        return kept
+
+    return {"G-buffer": read, KEPT: read_over}
 
 
 def mitsuba(vertices, faces, normals, camera, height, width) -> dict:
