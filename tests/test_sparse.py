@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shapeenh.numerics import smoothstep
-from shapeenh.sparse import at_ends, jumps_at, places_of, pull_near
+from shapeenh.sparse import at_ends, jumps_at, places_of, pull_near, spread
 from shapeenh.stencils import derivatives, derivatives_beside, links, shift
 
 SHAPE = (70, 90)
@@ -23,14 +23,24 @@ def test_pulling_near_flags(x64, rng, shape, share):
     a, b, c, d = (jnp.asarray(rng.standard_normal(shape)) for _ in range(4))
     flags = rng.random(shape) < share
     flags[-1, -1] = flags[0, 0] = share > 0
-    wanted = jax.vjp(lambda a: bent(a, b), a)[1]((c, d))[0]
-    (found,) = jax.jit(lambda *x: pull_near(jnp.asarray(flags), 2, bent, (x[0],), (x[1],), x[2:]))(a, b, c, d)
-    near = np.zeros(shape, bool)
+    flags = jnp.asarray(flags)
+
+    def pulled(c, d):
+        return jax.vjp(lambda a: bent(a, b), a)[1]((c, d))[0]
+
+    found = jax.jit(lambda flags, *bars: pull_near(flags, 2, bent, (a,), (b,), bars)[0])
+    at_flags = jnp.where(flags, c, 0), jnp.where(flags, d, 0)
+    np.testing.assert_allclose(found(flags, *at_flags), pulled(*at_flags), atol=1e-14)
+    whole = found(spread(flags, 2), c, d)
+    np.testing.assert_allclose(np.where(flags, whole, 0), np.where(flags, pulled(c, d), 0), atol=1e-14)
+
+
+def test_spread_flags(rng):
+    flags = rng.random((9, 30)) < 0.05
+    wanted = np.zeros_like(flags)
     for row, column in zip(*np.nonzero(flags), strict=True):
-        near[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = True
-    np.testing.assert_allclose(np.where(near, found, 0), np.where(near, wanted, 0), atol=1e-14)
-    far = np.asarray(found)[~near]
-    assert np.all((far == 0) | (np.abs(far - np.asarray(wanted)[~near]) < 1e-14))
+        wanted[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = True
+    np.testing.assert_array_equal(spread(jnp.asarray(flags), 2), wanted)
 
 
 def test_the_places_and_the_ends_of_a_few_links(rng):

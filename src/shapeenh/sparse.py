@@ -7,6 +7,7 @@ Imports nothing of ours.
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import jax
@@ -91,62 +92,75 @@ def put_back(few, border_x, border_y):
 
 
 # ------------------------------------------------------------------------------------------- tiles
+#
+# Tiles are cut out with a margin, `_BATCH` at a time, and laid side by side as one image: kernels run along its rows.
 
 _TILE = 16  # px; smaller ones hold fewer pixels without a derivative, larger ones have less margin
-_BATCH = 16  # tiles at a time, enough for a kernel to be worth its call
-_CELL = 4  # px, the grain in which the surroundings of a pixel are found
+_BATCH = 32  # tiles at a time, enough for a kernel to be worth its call
+
+
+def spread(flags, reach: int):
+    """[H, W] flags set in the square of pixels up to `reach` px away, too."""
+    for axis in (0, 1):
+        padded = jnp.pad(flags, [(reach, reach) if i == axis else (0, 0) for i in (0, 1)])
+        parts = [lax.slice_in_dim(padded, i, i + flags.shape[axis], axis=axis) for i in range(2 * reach + 1)]
+        flags = reduce(jnp.logical_or, parts)
+    return flags
 
 
 def pull_near(flags, reach: int, function, arrays, fixed, cotangents):
-    """What `cotangents` of `function(*arrays, *fixed)` pull back to `arrays`, where it is wanted: near the flags.
+    """What `cotangents` of `function(*arrays, *fixed)` pull back to `arrays`, those of flagged pixels and some more.
 
     flags: [H, W] bool; arrays, fixed: tuples of images [H, W]; function: to a tuple of such, whose values depend on
-        pixels up to `reach` away and on whether the image ends there; cotangents: a tuple of images.
-    *Static*: reach, at most 4 px.
-    Returns a tuple of [H, W], like `arrays`: right up to `reach` px from a flag, further away right or 0. The time
-    follows the number of tiles near a flag.
+        pixels up to `reach` away, and on what is outside of the image as if it were 0; cotangents: a tuple of images.
+    *Static*: reach.
+    Returns a tuple of [H, W], like `arrays`. The time follows the number of tiles with a flag.
     """
 
     def pull(arrays, fixed, cotangents):
         return jax.vjp(lambda *arrays: function(*arrays, *fixed), *arrays)[1](cotangents)
 
-    shape, side = flags.shape, _TILE + 4 * reach
+    shape, side = flags.shape, _TILE + 2 * reach
     if min(shape) < side:
         return pull(arrays, fixed, cotangents)
-    corners, count = _tiles_near(flags)
+    corners, count = _tiles_with(flags)
+
+    def strip(parts):
+        """[_BATCH, side, side] to [side, _BATCH * (side + reach)]: zeros between tiles, as outside of the image."""
+        return jnp.moveaxis(jnp.pad(parts, ((0, 0), (0, 0), (0, reach))), 0, 1).reshape(side, -1)
 
     def batch(i, out):
         corner = lax.dynamic_slice_in_dim(corners, i * _BATCH, _BATCH)
-        start = jnp.clip(corner - 2 * reach, 0, jnp.asarray([shape]) - side)
+        start = jnp.clip(corner - reach, 0, jnp.asarray([shape]) - side)
         cut = jax.vmap(lambda image, start: lax.dynamic_slice(image, start, (side, side)), (None, 0))
-        parts = jax.tree.map(lambda image: cut(image, start), (arrays, fixed, cotangents))
-        found = jax.vmap(pull)(*parts)
+        own = lax.broadcasted_iota(jnp.int32, (_BATCH, 2, side), 2) - (corner - start)[:, :, None]
+        own = (own >= 0) & (own < _TILE)
+        there = i * _BATCH + lax.iota(jnp.int32, _BATCH) < count
+        own = own[:, 0, :, None] & own[:, 1, None, :] & there[:, None, None]
+        bars = tuple(jnp.where(own, cut(bar, start), 0) for bar in cotangents)
+        found = pull(
+            *jax.tree.map(strip, (tuple(cut(a, start) for a in arrays), tuple(cut(a, start) for a in fixed), bars))
+        )
+        found = [bar.reshape(side, _BATCH, side + reach) for bar in found]
 
-        def write(k, out):
-            inner = corner[k] - start[k]
-            tiles = (lax.dynamic_slice(part[k], inner, (_TILE, _TILE)) for part in found)
-            return tuple(lax.dynamic_update_slice(a, tile, corner[k]) for a, tile in zip(out, tiles, strict=True))
+        def add(k, out):
+            def one(image, bar):
+                before = lax.dynamic_slice(image, start[k], (side, side))
+                return lax.dynamic_update_slice(image, before + bar[:, k, :side], start[k])
 
-        return lax.fori_loop(0, _BATCH, write, out)
+            return tuple(map(one, out, found))
+
+        return lax.fori_loop(0, _BATCH, add, out)
 
     out = tuple(jnp.zeros_like(array) for array in arrays)
     return lax.fori_loop(0, (count + _BATCH - 1) // _BATCH, batch, out)
 
 
-def _tiles_near(flags):
-    """(the corners [n, 2] of the tiles with a flag in them or up to `_CELL` px away, then others, their number)."""
-    height, width = flags.shape
-    rows, columns = -(-height // _TILE), -(-width // _TILE)
-    cells = jnp.pad(flags, ((0, rows * _TILE - height), (0, columns * _TILE - width)))
-    cells = jnp.any(cells.reshape(-1, _CELL, cells.shape[1]), axis=1)
-    cells = jnp.any(cells.reshape(cells.shape[0], -1, _CELL), axis=2)
-    around = jnp.pad(cells, 1)
-    around = around[:-2] | around[1:-1] | around[2:]
-    around = around[:, :-2] | around[:, 1:-1] | around[:, 2:]
-    per = _TILE // _CELL
-    hit = jnp.any(around.reshape(rows, per, columns, per), axis=(1, 3)).reshape(-1)
+def _tiles_with(flags):
+    """(the corners [n, 2] of the tiles with a flag in them, then others, their number)."""
+    rows, columns = (-(-size // _TILE) for size in flags.shape)
+    padded = jnp.pad(flags, [(0, n * _TILE - size) for n, size in zip((rows, columns), flags.shape, strict=True)])
+    hit = jnp.any(jnp.any(padded.reshape(rows, _TILE, -1), axis=1).reshape(rows, columns, _TILE), axis=2).reshape(-1)
     room = -(-hit.size // _BATCH) * _BATCH
     (index,) = jnp.nonzero(hit, size=room, fill_value=0)
-    corners = jnp.stack([index // columns, index % columns], axis=1) * _TILE
-    # the last tiles reach back over those before
-    return jnp.minimum(corners, jnp.asarray([[height - _TILE, width - _TILE]])), jnp.sum(hit)
+    return jnp.stack([index // columns, index % columns], axis=1) * _TILE, jnp.sum(hit)

@@ -15,7 +15,7 @@ from jax import lax
 
 from shapeenh.fusion import stored
 from shapeenh.numerics import safe_divide
-from shapeenh.sparse import dense, pull_near, steep
+from shapeenh.sparse import dense, pull_near, spread, steep
 
 # ------------------------------------------------------------------------------------------- neighbours
 
@@ -232,7 +232,8 @@ def _beside_bwd(saved, cotangents):
             d_x, d_y = derivatives(planes, link_x, link_y, always)
             return *d_x, *d_y
 
-        (found,) = pull_near(steep(conductance), 2, both, (conductance,), planes, (*d_x, *d_y))
+        near = spread(steep(conductance), 2)
+        (found,) = pull_near(near, 2, both, (conductance,), planes, (*d_x, *d_y))
     return *pull((d_x, d_y)), None, None, found, None
 
 
