@@ -37,7 +37,6 @@ from shapeenh.types import Camera, Mesh, Visibility
 CHUNK = 8192  # faces per step
 SLOTS = 65536  # candidate pixels per step
 PAIRS = 2048  # (face, window) pairs per step: small kernels run on one core, so few of them
-PART = 512  # pairs merged at a time: their keys stay in cache, and are made while those before are merged
 BORDER = max(TILE, WINDOW, *(k for window in WINDOWS for k in window))  # windows may hang over the right and lower edge
 NO_PAIR = np.int32(2**31 - 1)
 CULL = {False: "none", None: "none", "none": "none", True: "back", "back": "back", "front": "front"}
@@ -254,13 +253,8 @@ def draw_medium(always, keys, edges, plane, low, box, size, stride):
             return take(planes.reshape(-1), at[None] + np.arange(planes.shape[0], dtype=np.int32)[:, None] * n)
 
         local = [stored(always, of_faces, t, at) for t in (edges, plane)]
-        moved, moved_plane = stored(always, move_window, *local, column * WINDOW, row * WINDOW, there)
+        edges_there, plane_there = stored(always, move_window, *local, column * WINDOW, row * WINDOW, there)
         start = take(box[0], at) + (row * stride + column) * WINDOW
-        low_here = take(low, at)
-        for k in range(0, PAIRS, PART):
-            some = slice(k, k + PART)
-            new = window_keys(moved[..., some], moved_plane[:, some], low_here[some], WINDOW, WINDOW)
-            keys = merge(keys, new, start[some], stride)
-        return keys
+        return merge(keys, window_keys(edges_there, plane_there, take(low, at), WINDOW, WINDOW), start, stride)
 
     return lax.fori_loop(jnp.int32(0), (total + (PAIRS - 1)) // PAIRS, step, keys)
