@@ -137,10 +137,9 @@ def pull_near(flags, reach: int, function, arrays, fixed, cotangents):
         own = (own >= 0) & (own < _TILE)
         there = i * _BATCH + lax.iota(jnp.int32, _BATCH) < count
         own = own[:, 0, :, None] & own[:, 1, None, :] & there[:, None, None]
-        bars = tuple(jnp.where(own, cut(bar, start), 0) for bar in cotangents)
-        found = pull(
-            *jax.tree.map(strip, (tuple(cut(a, start) for a in arrays), tuple(cut(a, start) for a in fixed), bars))
-        )
+        parts = jax.tree.map(lambda image: cut(image, start), (arrays, fixed, cotangents))
+        bars = tuple(jnp.where(own, bar, 0) for bar in parts[2])
+        found = pull(*jax.tree.map(strip, (*parts[:2], bars)))
         found = [bar.reshape(side, _BATCH, side + reach) for bar in found]
 
         def add(k, out):
