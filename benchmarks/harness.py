@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import random
 import statistics
 import time
 from pathlib import Path
@@ -25,7 +26,8 @@ RESULTS = Path(__file__).parent / "results" / ("quick" if QUICK else "")
 
 
 def measure(calls: dict, *, repeats: int = 9, seconds: float = 20.0) -> dict[str, dict[str, float]]:
-    """Time functions of no arguments in turns, so that a slow phase of the machine hits all of them alike.
+    """Time functions of no arguments in turns, so that a slow phase of the machine hits all of them alike; in another
+    order each time, so that none always finds the caches as the same other one leaves them.
 
     Returns per name: `first_ms` (compile and run), `median_ms`, `min_ms`, `runs`.
     """
@@ -33,10 +35,12 @@ def measure(calls: dict, *, repeats: int = 9, seconds: float = 20.0) -> dict[str
         repeats, seconds = min(repeats, 3), min(seconds, 2.0)
     times: dict[str, list[float]] = {name: [] for name in calls}
     first = {name: _milliseconds(call) for name, call in calls.items()}
+    order, shuffle = list(calls), random.Random(0).shuffle
     start = time.perf_counter()
     for _ in range(repeats):
-        for name, call in calls.items():
-            times[name].append(_milliseconds(call))
+        shuffle(order)
+        for name in order:
+            times[name].append(_milliseconds(calls[name]))
         if time.perf_counter() - start > seconds:
             break
     return {
