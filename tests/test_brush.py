@@ -363,6 +363,25 @@ def test_the_whole_chain_under_vmap_and_jit():
         np.testing.assert_allclose(together[k], alone, atol=1e-4)
 
 
+def test_gradients_end_where_footprints_end(x64):
+    """Along a random direction, of stamps that a depth step cuts off, against differences."""
+    gbuffer, descriptor = two_sheets(X + 0.4 * Y < 3)
+    profile, field = jax.tree.map(lambda a: a if a.dtype == bool else a.astype(jnp.float64), straight(angle=0.3))
+    rng = np.random.default_rng(2)
+    change, weights = (jnp.asarray(rng.normal(size=s)) for s in (profile.distance.shape, (SIZE, SIZE, 4)))
+
+    @jax.jit
+    def value(step):
+        bent = replace(profile, distance=profile.distance + step * change)
+        brush = se.Brush(radius=3.0 + step, color=(0.5, 0.2, 0.1), grow=0.5 + step)
+        sheets = {"gbuffer": gbuffer, "descriptor": descriptor}
+        return jnp.sum(weights * se.draw_lines(bent, field, brush, footprint="ellipse", reach=4, **sheets))
+
+    difference = (value(1e-6) - value(-1e-6)) / 2e-6
+    assert abs(difference) > 1
+    np.testing.assert_allclose(jax.grad(value)(0.0), difference, rtol=1e-6)
+
+
 def test_gradients_are_finite_at_empty_profiles():
     zero = jnp.zeros((6, 7), jnp.float32)
     profile = Profile(zero, zero, zero, zero > 0)

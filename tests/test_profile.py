@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 import shapeenh as se
 from shapeenh.lines import profile as module
-from shapeenh.types import LineField
+from shapeenh.types import LineField, Profile, replace
 from tests.reference import lines as reference
 
 # ------------------------------------------------------------------------------------------- ripples (TH10 fig. 7.2)
@@ -142,14 +142,43 @@ def test_least_drops_the_profiles_that_are_not_higher():
     np.testing.assert_array_equal(high.distance, np.where(high.valid, every.distance, 0))
 
 
+@jax.jit
+def everywhere(field, least):
+    """Profiles of all pixels, whether or not there can be one."""
+    planes = module.planes_of(field)
+    row, col = (jnp.asarray(i, jnp.int32) for i in np.indices(field.height.shape))
+    return Profile(*module._fit(planes[:2], row, col, *planes[2:], least, radius=4.0, samples=9))
+
+
 def test_skipping_pixels_changes_nothing():
-    field, _ = ripples()
-    for least in (-np.inf, 0.0, 0.4):
-        some = se.fit_profile(field, least=least)
-        every = jax.jit(se.fit_profile)(field, least=least)
-        np.testing.assert_array_equal(some.valid, every.valid)
-        np.testing.assert_allclose(some.distance, every.distance, atol=1e-5)
-        np.testing.assert_allclose(some.height, every.height, atol=1e-6)
+    plain, _ = ripples()
+    walled = replace(plain, singularity=plain.singularity.at[:, 7].set(1).at[9].set(0.4))
+    for field, least in [(plain, -np.inf), (plain, 0.0), (plain, 0.4), (walled, 0.0)]:
+        every = everywhere(field, least)
+        assert np.any(every.valid)
+        for some in (se.fit_profile(field, least=least), jax.jit(se.fit_profile)(field, least=least)):
+            np.testing.assert_array_equal(some.valid, every.valid)
+            np.testing.assert_allclose(some.distance, every.distance, atol=1e-5)
+            np.testing.assert_allclose(some.height, every.height, atol=1e-6)
+
+
+def test_gradients_of_listed_pixels_are_those_of_all(x64):
+    plain, _ = ripples()
+    field = replace(plain, singularity=plain.singularity.at[:, 7].set(0.9).at[9].set(0.4))
+    field = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), field)
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=(3, *field.height.shape)))
+
+    def loss(fit):
+        def weighed(field):
+            found = fit(field, least=0.0)
+            planes = jnp.stack([found.distance, found.height, found.curvature])
+            return jnp.sum(weights * planes)
+
+        return jax.jit(jax.grad(weighed))(field)
+
+    for some, every in zip(*(jax.tree.leaves(loss(fit)) for fit in (se.fit_profile, everywhere)), strict=True):
+        assert np.any(np.asarray(every) != 0)
+        np.testing.assert_allclose(some, every, atol=1e-12 * np.max(np.abs(every)))
 
 
 # ------------------------------------------------------------------------------------------- singularities

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import register_dataclass
 
-from shapeenh.checks import check_range, check_shape, check_size, check_type, float_dtype, is_concrete
-from shapeenh.lines.accumulate import crossings_on_host, draw_everywhere, draw_listed, framed_stamps, list_runs
+from shapeenh.checks import check_range, check_shape, check_size, check_type, float_dtype, is_concrete, is_zero
+from shapeenh.lines.accumulate import crossings_on_host, draw_listed, draw_traced, framed_stamps, list_runs
 from shapeenh.lines.depth_steps import check_surface, depth_barriers
 from shapeenh.lines.noise import CHANNELS
 from shapeenh.lines.stamps import FOOTPRINTS, LENGTH_WITHIN
@@ -109,7 +109,8 @@ def draw_lines(
         brush, whether it grows, wobbles, and has more than one colour: what it does not do costs nothing.
     Returns: [H, W, 4], premultiplied linear RGBA, alpha in [0, 1[; 0 where nothing is drawn.
         `picture * (1 - alpha) + rgb` lays it over a picture.
-    Gradient: with respect to profile, brush, shading, noise and footprint image.
+    Gradient: with respect to profile, brush, shading, noise and footprint image; not through what a footprint function
+        closes over. In reverse mode alone.
     Errors: ValueError for shapes that disagree, numbers out of range, and noise or shading that a brush lacks.
 
     >>> strokes = se.draw_lines(profile, field, se.Brush(radius=2.0, low=0.02, high=0.1))
@@ -132,14 +133,15 @@ def draw_lines(
     image, function = _footprint(footprint, dtype)
     reach = _reach(brush, reach, function)
     concrete = is_concrete(profile, field, brush, shading, noise, image, gbuffer, descriptor)
-    wants = _wants(brush, shading, noise, function) if concrete else {}
+    wants = _wants(brush, shading, noise, function)
     # one by one, JAX's arrays take as long to make as a small picture takes to draw
     array: Any = np.asarray if is_concrete(brush) else jnp.asarray
     brush = Brush(**{name: array(value, dtype) for name, value in vars(brush).items()})
     options = {"function": function, "reach": reach}
     if not concrete:
         barriers = None if gbuffer is None else depth_barriers(gbuffer, descriptor)
-        return draw_everywhere(profile, field, brush, shading, noise, image, barriers, **options)
+        traced = {**options, "wants": tuple(wants.items())}
+        return draw_traced(profile, field, brush, shading, noise, image, barriers, **traced)
     valid = np.asarray(profile.valid)
     margin = _margin(profile, wants["sifted"], wants["colored"] and float(brush.shade) > 0)
     tiles = list_tiles(valid, margin)
@@ -155,15 +157,16 @@ def draw_lines(
 
 
 def _wants(brush, shading, noise, function) -> dict[str, bool]:
-    """Which planes of the stamps differ from pixel to pixel."""
-    shaded = shading is not None and float(brush.shade) > 0
-    tinted, moved = (noise is not None and float(strength) > 0 for strength in (brush.tint, brush.wobble))
+    """Which planes of the stamps differ from pixel to pixel, as far as is known."""
+    shaded = shading is not None and not is_zero(brush.shade)
+    tinted, moved, uneven = (noise is not None and not is_zero(a) for a in (brush.tint, brush.wobble, brush.uneven))
     return {
         "colored": shaded or tinted,
         "turned": function != "disc",
         "moved": moved,
-        "sifted": float(brush.shortest) > 0,
-        "grown": float(brush.grow) > 0 or float(brush.swell) > 0 or (noise is not None and float(brush.uneven) > 0),
+        "sifted": not is_zero(brush.shortest),
+        # `stamps_planes` sees to radii near 0, which `draw_lines` refuses if it can
+        "grown": not is_zero(brush.grow, brush.swell) or uneven or not is_concrete(brush.radius),
     }
 
 

@@ -19,6 +19,7 @@ from shapeenh.numerics import normalize, smoothstep
 
 GAMMA_MAX = 1.0  # the accumulated singularity that ends a trajectory (TH10 7.2.2)
 CHUNK = 1 << 12  # pixels that are fitted at a time
+RUN = 8  # pixels that are listed together where the list is made at run time
 FREE, HELD = 1, 2  # candidates without and with a singularity near
 _OVERSHOOT = 1.3  # a maximum of a cubic fitted to heights within [0, 1] is below 1.28, for 5 to 65 samples
 
@@ -77,25 +78,43 @@ def read(plane, row, col):
     r, c = jnp.clip(row + 1, 0, h - 1), jnp.clip(col + 1, 0, w - 1)
     r0, c0 = jnp.minimum(jnp.floor(r), h - 2), jnp.minimum(jnp.floor(c), w - 2)
     fr, fc = r - r0, c - c0
-    index = r0.astype(jnp.int32) * w + c0.astype(jnp.int32)
-    flat = plane.ravel()
-    a, b, d, e = (flat.at[index + step].get(mode="promise_in_bounds") for step in (0, 1, w, w + 1))
+    a, b, d, e = _corners(plane, r0.astype(jnp.int32) * w + c0.astype(jnp.int32))
     top, bottom = a + fc * (b - a), d + fc * (e - d)
     return top + fr * (bottom - top)
+
+
+def _places(plane, index):
+    return [index + step for step in (0, 1, plane.shape[1], plane.shape[1] + 1)]
+
+
+@jax.custom_vjp
+def _corners(plane, index):
+    """The values at a place and to the right of it, and below both. Gradient: one pass for all four, reverse mode."""
+    return tuple(plane.ravel().at[place].get(mode="promise_in_bounds") for place in _places(plane, index))
+
+
+def _corners_backward(saved, cotangents):
+    plane, index = saved
+    bar = jnp.zeros_like(plane).ravel()
+    bar = bar.at[jnp.stack(_places(plane, index))].add(jnp.stack(cotangents), mode="promise_in_bounds")
+    return bar.reshape(plane.shape), None
+
+
+_corners.defvjp(lambda plane, index: (_corners(plane, index), (plane, index)), _corners_backward)
 
 
 # ------------------------------------------------------------------------------------------- which pixels
 
 
 def looked_at(field, least, radius):
-    """(heights and singularities as `planes_of` returns them, what `_candidates` returns), worked out only near heights
-    that a line can come from."""
+    """(heights and singularities as `planes_of` returns them, what `candidates_of` returns), worked out only near
+    heights that a line can come from."""
     reach = int(np.ceil(radius)) + 1  # px, how far a fit reads
     margin = margin_for(reach + 3)
     tiles = None if margin is None else list_tiles(_high(field, least), margin, around=2 * reach + 3)
     if tiles is None:
         planes = _stored_planes(field)
-        return planes[:2], _candidates(planes, least, radius=radius)
+        return planes[:2], candidates_of(planes, least, radius=radius)
     *planes, candidates = _tiled(field, least, tiles, margin=margin, radius=radius)
     return tuple(planes), candidates
 
@@ -116,7 +135,7 @@ def _tiled(field, least, tiles, *, margin, radius):
 
     def look(field):
         planes = stored(always, planes_of, field)
-        return *planes[:2], stored(always, partial(_candidates, radius=radius), planes, least)
+        return *planes[:2], stored(always, partial(candidates_of, radius=radius), planes, least)
 
     return over_tiles(look, field, tiles, (0, 1, 0), margin=margin)
 
@@ -135,8 +154,24 @@ def list_pixels(candidates):
     return listed, np.asarray([start, chunks], np.int32)
 
 
+def list_flagged(flags):
+    """(numbers [n] int32 of the runs of [H, W] that hold a flag, how many chunks of them), under a transformation."""
+    hit = jnp.any(jnp.pad(flags.ravel(), (0, -flags.size % RUN)).reshape(-1, RUN), axis=1)
+    step = CHUNK // RUN
+    (runs,) = jnp.nonzero(hit, size=hit.size + step, fill_value=hit.size)
+    return runs.astype(jnp.int32), -(-jnp.sum(hit, dtype=jnp.int32) // step)
+
+
+def pixels_of(runs, k):
+    """[CHUNK] pixels of chunk k of the runs; what fills the list up lies beyond the image."""
+    step = CHUNK // RUN
+    return (
+        lax.dynamic_slice_in_dim(runs, k * step, step)[:, None] * RUN + np.arange(RUN, dtype=np.int32)[None]
+    ).ravel()
+
+
 @partial(jax.jit, static_argnames=("radius",))
-def _candidates(planes, least, *, radius):
+def candidates_of(planes, least, *, radius):
     """[H, W] uint8: where a profile higher than `least` is possible, FREE or, where a singularity may end the
     neighbourhood, HELD; else 0."""
     h, w = planes[2].shape

@@ -16,9 +16,22 @@ from jax import lax
 
 from shapeenh.checks import check_choice, check_range, check_shape, check_size, check_type, float_dtype, is_concrete
 from shapeenh.fusion import stored, unknown_truth
-from shapeenh.lines.candidates import CHUNK, GAMMA_MAX, list_pixels, looked_at, planes_of, read
+from shapeenh.lines.candidates import (
+    CHUNK,
+    FREE,
+    GAMMA_MAX,
+    HELD,
+    candidates_of,
+    list_flagged,
+    list_pixels,
+    looked_at,
+    pixels_of,
+    planes_of,
+    read,
+)
 from shapeenh.lines.tiles import different
 from shapeenh.numerics import normalize, smoothstep
+from shapeenh.sparse import dense
 from shapeenh.types import LineField, Profile
 
 LEAST_REACH = 1.0  # px: a neighbourhood narrower than this shows no neighbour on either side, hence no profile
@@ -43,7 +56,7 @@ def fit_profile(field, *, radius: float = 4.0, samples: int = 9, least=0.0) -> P
     Static: radius, samples.
     Returns: Profile [H, W]; all fields are 0, and `valid` False, where no skeleton was found.
     Gradient: with respect to height, direction and singularity, finite everywhere; 0 where not valid. None through
-        which pixels are valid.
+        which pixels are valid. In reverse mode alone.
     Errors: ValueError for fields whose shapes disagree, and for numbers out of range.
 
     >>> profile = se.fit_profile(se.line_field("ridge", gbuffer, descriptor))
@@ -69,20 +82,10 @@ def fit_profile(field, *, radius: float = 4.0, samples: int = 9, least=0.0) -> P
     if h == 0 or w == 0:
         raise ValueError(f"field.height has shape {(h, w)}; accepted are images of at least one pixel")
     if not concrete:
-        return _fit_everywhere(field, least, **options)
+        return _fit_traced(field, least, **options)
     planes, candidates = looked_at(field, least, float(radius))
     listed, counts = list_pixels(np.asarray(candidates))
     return _fit_listed(planes, field.direction, listed, counts, least, **options)
-
-
-@partial(jax.jit, static_argnames=("radius", "samples"))
-def _fit_everywhere(field, least, *, radius, samples) -> Profile:
-    planes = planes_of(field)
-    h, w = planes[2].shape
-    row = jnp.broadcast_to(lax.iota(jnp.int32, h)[:, None], (h, w))
-    col = jnp.broadcast_to(lax.iota(jnp.int32, w)[None, :], (h, w))
-    theta = planes[2], planes[3]
-    return Profile(*_fit(planes, row, col, *theta, least, radius=radius, samples=samples))
 
 
 @partial(jax.jit, static_argnames=("radius", "samples"))
@@ -96,12 +99,108 @@ def _fit_listed(planes, direction, listed, counts, least, *, radius, samples) ->
         inside = jnp.minimum(index, h * w - 1)
         x, y = stored(always, lambda index: normalize(direction.reshape(h * w, 2)[index]).T, inside)
         found = _fit(planes, inside // w, inside % w, x, y, least, radius=radius, samples=samples, held=held)
-        return tuple(o.at[index].set(f, mode="drop", unique_indices=False) for o, f in zip(out, found, strict=True))
+        return _written(out, index, found)
 
-    out = *(jnp.full(h * w, b, planes[0].dtype) for b in different((0, 0, 0), least)), jnp.zeros(h * w, bool)
+    out = _nothing(planes[0], h * w, least)
     out = lax.fori_loop(0, counts[0], partial(chunk, held=False), out)
     out = lax.fori_loop(counts[0], counts[0] + counts[1], partial(chunk, held=True), out)
     return Profile(*(o.reshape(h, w) for o in out))
+
+
+def _nothing(height, size: int, least):
+    """Where no profile was found, as [H * W]."""
+    return *(jnp.full(size, b, height.dtype) for b in different((0, 0, 0), least)), jnp.zeros(size, bool)
+
+
+def _written(out, index, found):
+    return tuple(o.at[index].set(f, mode="drop") for o, f in zip(out, found, strict=True))
+
+
+# ------------------------------------------------------------------------------------------- under a transformation
+
+
+@partial(jax.jit, static_argnames=("radius", "samples"))
+def _fit_traced(field, least, *, radius, samples) -> Profile:
+    """`_fit` where there may be a profile, listed at run time. Gradient: in reverse mode, where there is one."""
+    planes = planes_of(field)
+    constant = lax.stop_gradient((planes, least))
+    candidates = stored(unknown_truth(planes[0], least), partial(candidates_of, radius=radius), *constant)
+    return Profile(*_profiles((radius, samples), planes, least, candidates))
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _profiles(how, planes, least, candidates):
+    """(distance, height, curvature, valid), [H, W], of what `planes_of` and `candidates_of` return."""
+    shape = candidates.shape
+
+    def chunk(out, index, inside, held):
+        values = _at_pixels(planes, inside)
+        return _written(out, index, _fit_at(how, values, inside, shape[1], least, held))
+
+    out = _each_chunk(chunk, _nothing(planes[0], candidates.size, least), candidates, candidates > 0)
+    return tuple(o.reshape(shape) for o in out)
+
+
+def _at_pixels(planes, inside):
+    """Heights and singularities, which are read anywhere, and the directions of the pixels."""
+    return *planes[:2], *(plane.ravel().at[inside].get(mode="promise_in_bounds") for plane in planes[2:])
+
+
+def _fit_at(how, values, inside, width: int, least, held):
+    radius, samples = how
+    *planes, x, y = values
+    return _fit(planes, inside // width, inside % width, x, y, least, radius=radius, samples=samples, held=held)
+
+
+def _each_chunk(function, carry, candidates, flags):
+    """`function(carry, pixels, the same within the image, held)` over all flagged pixels, and others beyond the image;
+    those near singularities last, since only their neighbourhoods may have to end."""
+    size, candidates = candidates.size, jnp.where(flags, candidates, 0)
+    for kind, held in ((FREE, False), (HELD, True)):
+        runs, chunks = list_flagged(candidates == kind)
+
+        def step(k, carry, runs=runs, kind=kind, held=held):
+            index = pixels_of(runs, k)
+            inside = jnp.minimum(index, size - 1)
+            index = jnp.where(candidates.ravel()[inside] == kind, index, size)
+            return function(carry, index, inside, held)
+
+        carry = lax.fori_loop(0, chunks, step, carry)
+    return carry
+
+
+def _profiles_forward(how, planes, least, candidates):
+    wanted = tuple(() if plane.perturbed else None for plane in planes)
+    planes, least, candidates = tuple(p.value for p in planes), least.value, candidates.value
+    found = _profiles(how, planes, least, candidates)
+    return found, (planes, least, candidates, found[3], wanted)
+
+
+def _profiles_backward(how, saved, cotangents):
+    planes, least, candidates, valid, wanted = saved
+    shape = candidates.shape
+    bars = [dense(bar).ravel() for bar in cotangents[:3]]
+    asked = [k for k, want in enumerate(wanted) if want is not None]
+
+    def chunk(found, index, inside, held):
+        values = _at_pixels(planes, inside)
+
+        def fit(some):
+            chosen = [some.get(k, value) for k, value in enumerate(values)]
+            return _fit_at(how, chosen, inside, shape[1], least, held)[:3]
+
+        given = tuple(jnp.where(index < candidates.size, bar[inside], 0) for bar in bars)
+        (pulled,) = jax.vjp(fit, {k: values[k] for k in asked})[1](given)
+        for k, bar in pulled.items():
+            found[k] = found[k] + bar if k < 2 else found[k].at[index].set(bar, mode="drop")
+        return found
+
+    found = {k: jnp.zeros_like(planes[k] if k < 2 else bars[0]) for k in asked}
+    found = _each_chunk(chunk, found, candidates, valid)
+    return tuple(found[k].reshape(planes[k].shape) if k in found else None for k in range(4)), None, None
+
+
+_profiles.defvjp(_profiles_forward, _profiles_backward, symbolic_zeros=True)
 
 
 # ------------------------------------------------------------------------------------------- the profile

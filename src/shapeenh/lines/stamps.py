@@ -33,6 +33,14 @@ class Stamps(NamedTuple):
     moved: Any
 
 
+class Tip(NamedTuple):
+    """What footprints read of a brush."""
+
+    color: jax.Array
+    radius: jax.Array
+    aspect: jax.Array
+
+
 # ------------------------------------------------------------------------------------------- weights (8.2), T_x (8.3)
 
 
