@@ -74,7 +74,7 @@ def _assemble(first, *arguments, **options) -> LineField:
         call = lambda function, *values, **options: stored(always, partial(function, **options), *values)  # noqa: E731
     planes, (link_x, link_y), time, known = call(first, *arguments, **options)
     if not (is_concrete(time) and float(time[0, 0]) == 0):
-        planes = [call(_diffused, plane, link_x, link_y, time) for plane in planes]
+        planes = [_diffused(plane, link_x, link_y, time) for plane in planes]  # a loop is a border, too
     height, direction, around, flags = call(_directions, planes, known, time)
     return LineField(height, direction, call(_singularity, around, *flags))
 
