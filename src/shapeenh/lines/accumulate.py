@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 
 from shapeenh.fusion import stored, unknown_truth
-from shapeenh.lines.stamps import Stamps, Tip, imprint, stamps_planes, tinted
+from shapeenh.lines.stamps import Stamps, imprint, stamps_planes, tinted
 from shapeenh.lines.tiles import over_tiles
 
 LANES = 64
@@ -154,23 +154,23 @@ def draw_listed(stamps: Stamps, listed, counts, brush, noise, image, crossed, *,
         if noise is not None:
             column = jnp.minimum((run % runs * LANES)[:, None] + jnp.arange(LANES, dtype=run.dtype)[None], shape[1] - 1)
             sheet = noise[(run // runs)[:, None], column, 0]
-        return _compress(total, brush, sheet)
+        return compress(total, brush, sheet)
 
-    return _gathered(picture, 4, (function, reach, shape), stamps, listed, counts, brush, image, crossed)
+    return gathered(picture, 4, (function, reach, shape), stamps, listed, counts, brush, image, crossed)
 
 
-def _gathered(finish, outputs: int, how, stamps: Stamps, listed, counts, brush, image, crossed):
+def gathered(finish, outputs: int, how, stamps: Stamps, listed, counts, brush, image, crossed):
     """`finish(sums, runs)` of the sums at the listed runs, planes [GROUP, LANES], as [H, W, outputs]; 0 elsewhere."""
     function, reach, (h, w) = how
     runs = -(-w // LANES)
     side = 2 * reach + 1
     planes, counted = jax.tree.map(jnp.ravel, (stamps, crossed or ()))
-    channels, own_rgb = _channels(stamps, brush, image, function)
+    channels, own_rgb = channels_of(stamps, brush, image, function)
     always = unknown_truth(stamps.weight)
 
     def group(k, canvas, *, cut):
         run = lax.dynamic_slice_in_dim(listed, k * GROUP, GROUP)
-        rows = partial(_row_of_window, run, runs, reach)
+        rows = partial(row_of_window, run, runs, reach)
 
         def row(i, total):
             window = jax.tree.map(lambda plane: rows(plane, i), planes)
@@ -198,7 +198,7 @@ def _gathered(finish, outputs: int, how, stamps: Stamps, listed, counts, brush, 
     return canvas.reshape(h, runs * LANES, outputs)[:, :w]
 
 
-def _channels(stamps: Stamps, brush, image, function):
+def channels_of(stamps: Stamps, brush, image, function):
     """(4, or 1 where all stamps have the brush's colour; whether footprints have colours of their own)."""
     one = jax.tree.map(lambda plane: plane.ravel()[:1], stamps)
     own_rgb = jax.eval_shape(lambda p: imprint(p, 0.0, 0.0, brush, image, function), one)[1] is not None
@@ -212,20 +212,20 @@ def _row_of_stamps(window, places, *, y, reach, brush, image, function):
         here, middle = slice(j, j + LANES), slice(reach, reach + LANES)
         stamp = jax.tree.map(lambda plane, here=here: plane[:, here], window)
         if places:
-            free = _unhindered(places, here, middle)
+            free = unhindered(places, here, middle)
             stamp = stamp._replace(weight=jnp.where(free, stamp.weight, 0))
         found.append(imprint(stamp, jnp.asarray(reach - j, y.dtype), y, brush, image, function))
     return found
 
 
-def _unhindered(places, at_stamp, at_pixel):
+def unhindered(places, at_stamp, at_pixel):
     """`_free` of runs in two rows of windows; places: the crossings along the stamps' row, along the pixels' row."""
     of_stamp, of_pixel = places[:2], places[2:]
     corners = (of_stamp, at_stamp), (of_pixel, at_pixel), (of_stamp, at_pixel), (of_pixel, at_stamp)
     return _free(*([count[:, part] for count in counts] for counts, part in corners))
 
 
-def _row_of_window(run, runs: int, reach: int, flat, i):
+def row_of_window(run, runs: int, reach: int, flat, i):
     """[runs, LANES + 2 reach]: row `i` of the windows around runs, of a plane in the frame of `rim`, flattened."""
     corner = run // runs * (runs * LANES + 2 * reach) + run % runs * LANES
     return _read_runs(flat, corner + i * (runs * LANES + 2 * reach), LANES + 2 * reach)
@@ -238,7 +238,7 @@ def _read_runs(flat, start, width: int):
     return lax.gather(flat, start[:, None], numbers, (width,), mode=mode)
 
 
-def _compress(total, brush, paper):
+def compress(total, brush, paper):
     """Paper, then all four channels by one factor, so that alpha = 1 - exp(-I_a) and colours stay."""
     depth = total[-1] if paper is None else total[-1] * (1 - brush.paper * paper)
     small = depth < 1e-4
@@ -247,110 +247,3 @@ def _compress(total, brush, paper):
         factor = factor * (1 - brush.paper * paper)
     rgb = total[:3] if len(total) == 4 else [total[0] * brush.color[i] for i in range(3)]
     return [plane * factor for plane in (*rgb, total[-1])]
-
-
-# ------------------------------------------------------------------------------------------- under a transformation
-
-
-@partial(jax.jit, static_argnames=("wants", "function", "reach"))
-def draw_traced(profile, field, brush, shading, noise, image, barriers, *, wants, function, reach):
-    """The picture [H, W, 4] from runs that are listed at run time. Gradient: exact, in reverse mode."""
-    shape, frame = profile.distance.shape, rim(profile.distance.shape[1], reach)
-    stamps = framed_stamps((profile, field, shading, noise), brush, None, wants=wants, margin=None, reach=reach)
-    crossed = None if barriers is None else tuple(jnp.pad(count, frame) for count in crossings(barriers))
-    # without flow no stamp has a weight, but that has a derivative
-    inked = (stamps.weight > 0) | jnp.pad(profile.valid & (brush.flow == 0), frame)
-    tip = Tip(brush.color, brush.radius, brush.aspect)
-    total = _sums((function, reach, shape), stamps, tip, image, crossed, inked)
-    total = [total[..., i] for i in range(total.shape[-1])]
-    return jnp.stack(_compress(total, brush, None if noise is None else noise[..., 0]), axis=-1)
-
-
-def _list_inked(inked, reach: int):
-    """(runs [n] int32, how many of them) with a flag within `reach`; inked: [H, W] and so many pixels around it."""
-    near = lax.reduce_window(inked, False, lax.bitwise_or, (1, LANES + 2 * reach), (1, LANES), "valid")
-    near = lax.reduce_window(near, False, lax.bitwise_or, (2 * reach + 1, 1), (1, 1), "valid")
-    (listed,) = jnp.nonzero(near.ravel(), size=near.size + GROUP, fill_value=0)
-    return listed.astype(jnp.int32), jnp.sum(near, dtype=jnp.int32)
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _sums(how, stamps, tip, image, crossed, inked):
-    """I of every pixel, [H, W, channels]. how: (function, reach, (H, W)); inked: which stamps count, in the frame.
-
-    Gradient: with respect to stamps, tip and image. Pixels gather from stamps, and stamps their derivatives from
-    pixels: the same walk, along the runs that hold stamps.
-    """
-    listed, total = _list_inked(inked, how[1])
-    steps = -(-total // GROUP)
-    counts = (steps, 0) if crossed is None else (0, steps)
-    channels, _ = _channels(stamps, tip, image, how[0])
-    return _gathered(lambda total, run: total, channels, how, stamps, listed, counts, tip, image, crossed)
-
-
-def _sums_forward(how, *arguments):
-    is_leaf = lambda leaf: hasattr(leaf, "perturbed")  # noqa: E731
-    wanted = tuple(() if leaf.perturbed else None for leaf in jax.tree.leaves(arguments[:3], is_leaf=is_leaf))
-    arguments = jax.tree.map(lambda leaf: leaf.value, arguments, is_leaf=is_leaf)
-    return _sums(how, *arguments), (arguments, wanted)
-
-
-def _sums_backward(how, saved, cotangent):
-    function, reach, (h, w) = how
-    (*sources, crossed, inked), wanted = saved
-    runs, channels, dtype = -(-w // LANES), cotangent.shape[2], cotangent.dtype
-    given = [jnp.pad(cotangent[..., i], rim(w, reach)).ravel() for i in range(channels)]
-    counted = [] if crossed is None else [count.ravel() for count in crossed]
-    listed, total = _list_inked(inked[reach:-reach, reach:-reach], 0)
-    leaves, structure = jax.tree.flatten(sources)
-    planes, tips = len(jax.tree.leaves(sources[0])), len(jax.tree.leaves(sources[:2]))
-    asked = [k for k, want in enumerate(wanted) if want is not None]
-
-    def group(k, found):
-        run = lax.dynamic_slice_in_dim(listed, k * GROUP, GROUP)
-        rows = partial(_row_of_window, run, runs, reach)
-        fresh = (k * GROUP + lax.iota(jnp.int32, GROUP) < total)[:, None]  # what fills the list up counts for nothing
-        middle = slice(reach, reach + LANES)
-        own = [rows(leaf.ravel(), reach)[:, middle] for leaf in leaves[:planes]]
-        own += [jnp.broadcast_to(a[..., None, None], (*a.shape, GROUP, LANES)) for a in leaves[planes:tips]]
-        own += leaves[tips:]
-
-        def row(i, bars):
-            window = [jnp.where(fresh, rows(plane, i), 0) for plane in given]
-            places = [rows(c, at) for at in (reach, i) for c in counted]
-            y = (reach - i).astype(dtype)
-
-            def inner(values):
-                """What the row's pixels weigh the stamps' marks with, added up."""
-                stamp, tip, image = jax.tree.unflatten(structure, [values.get(k, own[k]) for k in range(len(own))])
-                product = 0
-                for j in range(2 * reach + 1):
-                    here = slice(j, j + LANES)
-                    alpha, rgb = imprint(stamp, jnp.asarray(j - reach, dtype), y, tip, image, function)
-                    colors = [1] if channels == 1 else [*tinted(stamp, rgb, tip), 1]
-                    weighed = sum(bar[:, here] * c for bar, c in zip(window, colors, strict=True))
-                    if places:
-                        weighed = jnp.where(_unhindered(places, middle, here), weighed, 0)
-                    product = product + weighed * alpha
-                return product
-
-            _, pull = jax.vjp(inner, {k: own[k] for k in asked})
-            return jax.tree.map(jnp.add, bars, pull(jnp.ones((GROUP, LANES), dtype))[0])
-
-        bars = lax.fori_loop(0, 2 * reach + 1, row, {k: jnp.zeros_like(own[k]) for k in asked})
-        for k in asked:
-            if k < planes:
-                found[k] = found[k].at[run].add(bars[k], mode="promise_in_bounds")
-            else:
-                found[k] = found[k] + (jnp.sum(bars[k], axis=(-2, -1)) if k < tips else bars[k])
-        return found
-
-    found = {k: jnp.zeros((h * runs, LANES) if k < planes else leaves[k].shape, dtype) for k in asked}
-    found = lax.fori_loop(0, -(-total // GROUP), group, found)
-    for k in asked:
-        if k < planes:
-            found[k] = jnp.pad(found[k].reshape(h, runs * LANES), reach)
-    return *jax.tree.unflatten(structure, [found.get(k) for k in range(len(leaves))]), None, None
-
-
-_sums.defvjp(_sums_forward, _sums_backward, symbolic_zeros=True)

@@ -18,11 +18,12 @@ import numpy as np
 from jax.tree_util import register_dataclass
 
 from shapeenh.checks import check_range, check_shape, check_size, check_type, float_dtype, is_concrete, is_zero
-from shapeenh.lines.accumulate import crossings_on_host, draw_listed, draw_traced, framed_stamps, list_runs
+from shapeenh.lines.accumulate import crossings_on_host, draw_listed, framed_stamps, list_runs
 from shapeenh.lines.depth_steps import check_surface, depth_barriers
 from shapeenh.lines.noise import CHANNELS
 from shapeenh.lines.stamps import FOOTPRINTS, LENGTH_WITHIN
 from shapeenh.lines.tiles import list_tiles, margin_for
+from shapeenh.lines.traced import draw_traced
 from shapeenh.types import Descriptor, GBuffer, LineField, Profile
 
 LARGEST_REACH = 64
