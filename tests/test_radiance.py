@@ -227,6 +227,20 @@ def test_another_number_of_lights_does_not_recompile(rng, compilations):
     assert compilations.count("jit(_shade_image)") <= 1  # none when another test has compiled it
 
 
+def test_borders_of_fusion_outlast_constants(rng):
+    """A loss may close over all but one number; the borders between stages are not folded away with the constants."""
+    scene = make_scene(rng, np.float32)
+
+    def loss(alpha):
+        return jnp.sum(se.shade_warped(*scene, alpha=alpha))
+
+    def conditionals(function):
+        return jax.jit(function).lower(1.0).compile().as_text().count(" conditional(")
+
+    assert conditionals(loss) >= 2
+    assert conditionals(jax.grad(loss)) >= 4
+
+
 def test_empty_mask_and_images_of_any_size(dtype, rng):
     _, _, lights, material = make_scene(rng, dtype)
     for height, width in ((1, 1), (1, 70), (9, 8), (5, 3)):

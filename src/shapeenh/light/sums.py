@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from shapeenh.fusion import stored
+from shapeenh.fusion import stored, unknown_truth
 from shapeenh.light import blocks
 from shapeenh.light import weights as kernel
 
@@ -218,13 +218,18 @@ def _plane_array(plan: Plan, on, inputs):
     return jnp.stack([planes[name] for name in kernel.planes_of(plan.model)], axis=1), rest
 
 
+def _on(inputs, *others):
+    """A predicate for `stored`, from all that varies: somebody's jit may close over some of it."""
+    return unknown_truth(*(array for array in (*inputs.values(), *others) if array.size))
+
+
 def _forward(plan: Plan, mask, inputs, direction, radiance, count):
     """The image, and the walk."""
     height, width = mask.shape
     mask, inputs = blocks.padded(mask), {k: blocks.padded(v) if v.ndim >= 2 else v for k, v in inputs.items()}
     table = _light_table(direction, radiance, ladder(direction.shape[0], plan.chunk))
     walk, group = _plan_walk(plan, mask, inputs["normal"], table, count), _group(plan, mask)
-    on = walk.total >= 0
+    on = _on(inputs, direction, radiance)
 
     def step(i, image):
         ids = lax.dynamic_slice_in_dim(walk.ids, i * group, group)
@@ -270,8 +275,8 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
     inputs = {k: blocks.padded(v) if v.ndim >= 2 else v for k, v in inputs.items()}
     table = _light_table(direction, radiance, ladder(direction.shape[0], plan.chunk))
     group = _group(plan, mask)
-    on = walk.total >= 0
-    then = walk.ids[0] >= 0  # for the borders that follow one on `on`: see `stored`
+    on = _on(inputs, direction, radiance)
+    then = _on(inputs, direction, radiance, cotangent)  # for the borders that follow one on `on`: see `stored`
     lane = lax.iota(jnp.int32, group)
     moved = {plane for name, reached in plan.reach if name in wanted for plane in reached}
     names = kernel.planes_of(plan.model)
