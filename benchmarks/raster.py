@@ -5,7 +5,7 @@
 
 Without MESH: the embedded object, or bunny.obj (with --all armadillo.obj too) where SHAPEENH_DATA names a folder that
 has them. By default each mesh and its first subdivision, the latter at the first size only. `--all` takes subdivisions
-up to 6 million triangles and sizes up to 3840x2160, and half an hour or more.
+up to 6 million triangles and sizes up to 3840x2160, and two hours or more.
 
 All calls of a scene are timed in turns, so that a slow phase of the machine hits all alike; `first_ms` is compiling and
 running. One process per number of cores: the second finds what the first compiled in a temporary cache, so its
