@@ -282,6 +282,17 @@ def test_principal_directions(x64, rng):
         assert np.array_equal(se.principal_directions(jnp.asarray(umbilic))[0], [1, 0])
 
 
+def test_borders_of_fusion_outlast_constants():
+    """A loss may close over all but one number; the borders between stages are not folded away with the constants."""
+    gbuffer = buffer(reference.waves(24, 32)[0], np.float32)
+
+    def loss(foreshortening):
+        return jnp.sum(se.describe(gbuffer, sigma=2.0, foreshortening=foreshortening).hessian ** 2)
+
+    for function in (loss, jax.grad(loss)):
+        assert jax.jit(function).lower(0.5).compile().as_text().count(" conditional(") > 0
+
+
 # ------------------------------------------------------------------------------------------- edge cases
 
 

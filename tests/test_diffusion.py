@@ -188,7 +188,6 @@ def test_a_few_links_get_the_derivative_that_all_would_give_them(x64, rng, budge
     b = jnp.full((1, 1), 3.45) if budget == "one" else jnp.asarray(3.45 * rng.random((6, 7)))
     flags = [jnp.asarray(rng.random((6, 7)) < 0.2) for _ in "xy"]
     flags = flags[0].at[:, -1].set(False), flags[1].at[-1].set(False)
-
     places = places_of(flags, 20)
 
     def by_few(u, x, y, b):

@@ -13,13 +13,13 @@ from jax import lax
 
 
 def unknown_truth(*arrays):
-    """True, but not for the compiler, as long as one of the (non-empty) arrays is not a constant of the program.
+    """True, but not for the compiler, as long as one of the arrays that are not empty is no constant of the program.
 
     From all of them, because somebody's jit may close over some: then they are constants, and a border that rests on
     one of those alone is folded away.
     """
     total = jnp.int32(0)
-    for array in arrays:
+    for array in (array for array in arrays if array.size):
         first = lax.stop_gradient(array[(0,) * array.ndim])
         if jnp.issubdtype(first.dtype, jnp.floating):
             first = lax.bitcast_convert_type(lax.convert_element_type(first, jnp.float32), jnp.int32)

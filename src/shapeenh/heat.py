@@ -187,7 +187,6 @@ def _sweep(start, count, carry, fixed, rate, step, jumps, ahead=False):
     ahead: those of the cotangent are taken from the new one, for the next step, so that the old one can be overwritten;
         with one budget for all.
     """
-
     uniform = fixed[2].shape == (1, 1)
 
     def back(j, carry):

@@ -181,7 +181,8 @@ def _describe(gbuffer, corner, sigma, foreshortening, importance, degrees, *, si
 
 
 def _describe_all(gbuffer, sigma, foreshortening, importance, degrees, *, smoothing, with_creases):
-    always = unknown_truth(gbuffer.normal, gbuffer.position, sigma)
+    varies = gbuffer.normal, gbuffer.position, sigma, foreshortening, importance, degrees
+    always = unknown_truth(*jax.tree.leaves(varies))
 
     # 1-2: silhouettes and creases
     normal, good = stored(always, gradient.normal_planes, gbuffer)

@@ -218,18 +218,13 @@ def _plane_array(plan: Plan, on, inputs):
     return jnp.stack([planes[name] for name in kernel.planes_of(plan.model)], axis=1), rest
 
 
-def _on(inputs, *others):
-    """A predicate for `stored`, from all that varies: somebody's jit may close over some of it."""
-    return unknown_truth(*(array for array in (*inputs.values(), *others) if array.size))
-
-
 def _forward(plan: Plan, mask, inputs, direction, radiance, count):
     """The image, and the walk."""
     height, width = mask.shape
     mask, inputs = blocks.padded(mask), {k: blocks.padded(v) if v.ndim >= 2 else v for k, v in inputs.items()}
     table = _light_table(direction, radiance, ladder(direction.shape[0], plan.chunk))
     walk, group = _plan_walk(plan, mask, inputs["normal"], table, count), _group(plan, mask)
-    on = _on(inputs, direction, radiance)
+    on = unknown_truth(*inputs.values(), direction, radiance)
 
     def step(i, image):
         ids = lax.dynamic_slice_in_dim(walk.ids, i * group, group)
@@ -275,8 +270,9 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
     inputs = {k: blocks.padded(v) if v.ndim >= 2 else v for k, v in inputs.items()}
     table = _light_table(direction, radiance, ladder(direction.shape[0], plan.chunk))
     group = _group(plan, mask)
-    on = _on(inputs, direction, radiance)
-    then = _on(inputs, direction, radiance, cotangent)  # for the borders that follow one on `on`: see `stored`
+    on = unknown_truth(*inputs.values(), direction, radiance)
+    # for the borders that follow one on `on`: see `stored`
+    then = unknown_truth(*inputs.values(), direction, radiance, cotangent)
     lane = lax.iota(jnp.int32, group)
     moved = {plane for name, reached in plan.reach if name in wanted for plane in reached}
     names = kernel.planes_of(plan.model)
@@ -397,7 +393,7 @@ def shade_image(plan: Plan, mask, inputs, direction, radiance, count):
 def _shade_image_forward(plan, mask, inputs, direction, radiance, count):
     perturbed = [n for n, v in (inputs | {"direction": direction, "radiance": radiance}).items() if v.perturbed]
     mask, inputs, direction, radiance, count = jax.tree.map(
-        lambda leaf: leaf.value, (mask, inputs, direction, radiance, count), is_leaf=lambda x: hasattr(x, "perturbed")
+        lambda leaf: leaf.value, (mask, inputs, direction, radiance, count)
     )
     image, walk = _forward(plan, mask, inputs, direction, radiance, count)
     return image, (mask, inputs, direction, radiance, count, {name: None for name in perturbed}, walk)

@@ -98,8 +98,7 @@ def _fit_listed(planes, direction, listed, counts, least, *, radius, samples) ->
         index = lax.dynamic_slice_in_dim(listed, k * CHUNK, CHUNK)
         inside = jnp.minimum(index, h * w - 1)
         x, y = stored(always, lambda index: normalize(direction.reshape(h * w, 2)[index]).T, inside)
-        found = _fit(planes, inside // w, inside % w, x, y, least, radius=radius, samples=samples, held=held)
-        return _written(out, index, found)
+        return _written(out, index, _fit_at((radius, samples), (*planes, x, y), inside, w, least, held))
 
     out = _nothing(planes[0], h * w, least)
     out = lax.fori_loop(0, counts[0], partial(chunk, held=False), out)

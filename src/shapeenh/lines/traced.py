@@ -60,9 +60,8 @@ def _sums(how, stamps, tip, image, crossed, inked):
 
 
 def _sums_forward(how, *arguments):
-    is_leaf = lambda leaf: hasattr(leaf, "perturbed")  # noqa: E731
-    wanted = tuple(() if leaf.perturbed else None for leaf in jax.tree.leaves(arguments[:3], is_leaf=is_leaf))
-    arguments = jax.tree.map(lambda leaf: leaf.value, arguments, is_leaf=is_leaf)
+    wanted = tuple(() if leaf.perturbed else None for leaf in jax.tree.leaves(arguments[:3]))
+    arguments = jax.tree.map(lambda leaf: leaf.value, arguments)
     return _sums(how, *arguments), (arguments, wanted)
 
 
