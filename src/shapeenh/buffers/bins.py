@@ -17,8 +17,7 @@ from jax import lax
 
 from shapeenh.buffers.project import BEHIND, SUB, double_area, faces_viewer, pixel_box, three
 from shapeenh.buffers.windows import edge_functions
-from shapeenh.buffers.xla import take
-from shapeenh.fusion import stored
+from shapeenh.buffers.xla import apart, take
 
 WINDOWS = ((2, 2), (4, 4), (8, 8))  # rows, columns
 MEDIUM = len(WINDOWS) + 1
@@ -98,14 +97,14 @@ def bin_faces(always, faces, corners, height, width, cull, cells=None, side=1):
             index = lax.dynamic_slice(faces, (start, jnp.int32(0)), (size, 3)).T
             return take(flat, index[None] + (np.arange(2, dtype=np.int32) * vertices)[:, None, None])
 
-        xy = stored(always, fetch, faces)
+        xy = apart(always, fetch, faces)
 
         def kinds(xy):
             face = start + lax.iota(jnp.int32, size)
             new = (face >= i * size) & (face < count)
             return jnp.where(new, classify(xy[0], xy[1], height, width, cull, cells, side), jnp.uint8(0))
 
-        new = stored(always, class_words, stored(always, kinds, xy))
+        new = apart(always, class_words, apart(always, kinds, xy))
         return lax.dynamic_update_slice(words, new, (jnp.int32(0), i * (size // 32)))
 
     words = jnp.zeros((LARGE, blocks * size // 32), jnp.uint32)
@@ -148,7 +147,7 @@ def list_faces(always, words, ends, count, room):
     def step(i, faces):
         # sliced out here: LLVM does not vectorise what reads from a place that is known at run time only
         of_block = [lax.dynamic_slice(t, (jnp.int32(0), i * (size // 32)), (LARGE, size // 32)) for t in (words, ends)]
-        place = stored(always, places, *of_block).reshape(-1)
+        place = apart(always, places, *of_block).reshape(-1)
         face = block_start(i, count) + lax.iota(jnp.int32, size)
         return faces.at[place].set(face, mode="promise_in_bounds", wrap_negative_indices=False)
 

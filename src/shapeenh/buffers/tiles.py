@@ -15,8 +15,8 @@ from jax import lax
 
 from shapeenh.buffers.project import BEHIND, FAR_OFF, GUARD, ONE, SUB, faces_viewer, nearness, three, top_left
 from shapeenh.buffers.windows import merge, window_keys
-from shapeenh.buffers.xla import take
-from shapeenh.fusion import stored, unknown_truth
+from shapeenh.buffers.xla import apart, take
+from shapeenh.fusion import unknown_truth
 
 TILE = 8
 BITS = TILE.bit_length() - 1
@@ -141,16 +141,16 @@ def draw_tiles(keys, vertices, face, index, xyr, even, valid, m, near, shift, *,
         position = take(vertices.reshape(-1), index[None] * 3 + np.arange(3, dtype=np.int32)[:, None, None])
         return homogeneous(cast(position, F64), xyr, m, near, shift, height, width)
 
-    point = stored(always, points, index, xyr, m, wide_near, wide_shift)
-    abc = stored(always, lines, point[3:6])
-    edges = stored(always, integer_edges, abc, point[3:6], xyr)
+    point = apart(always, points, index, xyr, m, wide_near, wide_shift)
+    abc = apart(always, lines, point[3:6])
+    edges = apart(always, integer_edges, abc, point[3:6], xyr)
 
     def boxes(point, abc, xyr, even, valid):
         return tile_box(point, abc, xyr, even, valid, height, width, cull)
 
-    box = stored(always, boxes, point, abc, xyr, even, valid)
-    plane = stored(always, nearness_lines, point, abc)
-    limits = stored(always, nearness_range, xyr, near, shift)
+    box = apart(always, boxes, point, abc, xyr, even, valid)
+    plane = apart(always, nearness_lines, point, abc)
+    limits = apart(always, nearness_range, xyr, near, shift)
     ends = jnp.cumsum(box[3], dtype=jnp.int32)
     tiles = ends[-1]
 
@@ -179,9 +179,9 @@ def draw_tiles(keys, vertices, face, index, xyr, even, valid, m, near, shift, *,
     def step(state):
         j, keys = state
         pair = j * PAIRS + lax.iota(jnp.int32, PAIRS)
-        at = stored(always, locate, pair)
-        local = stored(always, local_edges, at, pair)
-        slope = stored(always, local_plane, at)
+        at = apart(always, locate, pair)
+        local = apart(always, local_edges, at, pair)
+        slope = apart(always, local_plane, at)
         low = ~cast(take(face, at[0]), jnp.uint32)
         return j + 1, merge(keys, window_keys(local, slope, low, TILE, TILE), at[2] * stride + at[1], stride)
 

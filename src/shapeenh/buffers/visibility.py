@@ -30,8 +30,8 @@ from shapeenh.buffers.windows import (
     window_box,
     window_keys,
 )
-from shapeenh.buffers.xla import take
-from shapeenh.fusion import stored, unknown_truth
+from shapeenh.buffers.xla import apart, take
+from shapeenh.fusion import unknown_truth
 from shapeenh.types import Camera, Mesh, Visibility
 
 CHUNK = 8192  # faces per step
@@ -103,7 +103,7 @@ def draw(vertices, faces, m, near, height, width, cull, cells, side):
     count = faces.shape[0]
     always = unknown_truth(vertices, m, faces)
     with jax.enable_x64(True):  # 64-bit keys, whatever the caller's precision
-        corners = stored(always, lambda v, m, near: project(v, m, near, height, width), vertices, m, near)
+        corners = apart(always, lambda v, m, near: project(v, m, near, height, width), vertices, m, near)
         shift = nearness_shift(corners)
         words, ends = bin_faces(always, faces, corners, height, width, cull, cells, side)
         totals = ends[:, -1]
@@ -124,9 +124,9 @@ def draw(vertices, faces, m, near, height, width, cull, cells, side):
                 return take(flat_corners, index.reshape(-1) + np.int32(plane * vertices.shape[0]))
 
             face = lax.dynamic_slice_in_dim(listed, begins[row] + first_rank, chunk)
-            own = stored(always, corner_indices, flat_faces, face)
-            index = stored(always, ascending, own)
-            xyr = [stored(always, functools.partial(fetch, plane=k), index).reshape(index.shape) for k in range(3)]
+            own = apart(always, corner_indices, flat_faces, face)
+            index = apart(always, ascending, own)
+            xyr = [apart(always, functools.partial(fetch, plane=k), index).reshape(index.shape) for k in range(3)]
             return row, face, jnp.minimum(totals[row] - first_rank, chunk), own, index, xyr
 
         def draw_narrow(i, keys):
@@ -185,7 +185,7 @@ def draw_pixels(always, keys, face, xyr, valid, shift, height, width):
         offset = np.add.outer(np.arange(rows) * stride, np.arange(columns)).astype(np.int32)
         return (y0 * stride + x0)[None] + offset.reshape(-1, 1)
 
-    new, at = stored(always, new_keys, face, xyr, valid, shift), stored(always, pixels, xyr)
+    new, at = apart(always, new_keys, face, xyr, valid, shift), apart(always, pixels, xyr)
     return keys.at[at.reshape(-1)].max(new.reshape(-1), mode="promise_in_bounds", wrap_negative_indices=False)
 
 
@@ -205,18 +205,18 @@ def draw_windows(always, keys, face, xyr, valid, shift, sizes, height, width):
         x, y = in_window(xyr, height, width)
         return jnp.stack(nearness_plane(x, y, nearness(xyr[2]) - shift))
 
-    box, edges = stored(always, boxes, xyr), stored(always, edge_planes, xyr, valid)
-    plane = stored(always, nearness_planes, xyr, shift)
+    box, edges = apart(always, boxes, xyr), apart(always, edge_planes, xyr, valid)
+    plane = apart(always, nearness_planes, xyr, shift)
     for (rows, columns), size in zip(WINDOWS[1:], sizes[:-1], strict=True):
         part = min(face.shape[0], SLOTS // (rows * columns))
 
         def draw_part(j, keys, rows=rows, columns=columns, part=part):
-            some = stored(always, lambda *t: cut(j * part, part, *t), edges, plane, low)
+            some = apart(always, lambda *t: cut(j * part, part, *t), edges, plane, low)
 
             def new_keys(edges, plane, low):
                 return window_keys(edges.reshape(3, 3, -1), plane, low, rows, columns)
 
-            return merge(keys, stored(always, new_keys, *some), cut(j * part, part, box[0])[0], stride)
+            return merge(keys, apart(always, new_keys, *some), cut(j * part, part, box[0])[0], stride)
 
         keys = lax.fori_loop(jnp.int32(0), (size + (part - 1)) // part, draw_part, keys)
     return draw_medium(always, keys, edges, plane, low, box, sizes[-1], stride)
@@ -232,7 +232,7 @@ def draw_medium(always, keys, edges, plane, low, box, size, stride):
         begins = jnp.where(windows > 0, ends - windows, NO_PAIR)
         return ends, jnp.append(begins, jnp.full((PAIRS,), NO_PAIR))
 
-    ends, begins = stored(size > 0, listed, box)  # of chunks of other classes, nothing
+    ends, begins = apart(size > 0, listed, box)  # of chunks of other classes, nothing
     total = ends[-1]
 
     def step(j, keys):
@@ -247,13 +247,13 @@ def draw_medium(always, keys, edges, plane, low, box, size, stride):
             row = number // take(box[1], at)
             return at, number - row * take(box[1], at), row, pair < total
 
-        at, column, row, there = stored(always, find, ends, begins, box)
+        at, column, row, there = apart(always, find, ends, begins, box)
 
         def of_faces(planes, at):
             return take(planes.reshape(-1), at[None] + np.arange(planes.shape[0], dtype=np.int32)[:, None] * n)
 
-        local = [stored(always, of_faces, t, at) for t in (edges, plane)]
-        edges_there, plane_there = stored(always, move_window, *local, column * WINDOW, row * WINDOW, there)
+        local = [apart(always, of_faces, t, at) for t in (edges, plane)]
+        edges_there, plane_there = apart(always, move_window, *local, column * WINDOW, row * WINDOW, there)
         start = take(box[0], at) + (row * stride + column) * WINDOW
         return merge(keys, window_keys(edges_there, plane_there, take(low, at), WINDOW, WINDOW), start, stride)
 
