@@ -124,6 +124,10 @@ def loss(function, values):
     return sum(jnp.mean(jnp.square(part)) for part in parts)
 
 
+def with_gradient(function):
+    return jax.jit(jax.value_and_grad(lambda values: loss(function, values)))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("mesh", nargs="?", type=Path)
@@ -136,7 +140,7 @@ def main() -> None:
     rows = []
     for stage, what, function, given in stages(mesh, width=width, height=height, count=arguments.lights):
         value = jax.jit(lambda v, f=function: loss(f, v))
-        both = jax.jit(jax.value_and_grad(lambda v, f=function: loss(f, v)))
+        both = with_gradient(function)
         calls = {
             "value": lambda f=value, v=given: f(v),
             "with gradient": lambda f=both, v=given: f(v),

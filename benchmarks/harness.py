@@ -2,7 +2,8 @@
 and maps.
 
 With the environment variable BENCHMARKS_QUICK (`python -m benchmarks --quick` sets it) everything is timed three times
-at most, and results go to a folder of their own: a rough look, and a test that every script runs.
+at most, and results go to a folder of their own: a rough look, and a test that every script runs. Memory is kept
+(`shapeenh.keep_memory`), for peers as for us, but with BENCHMARKS_FRESH_MEMORY=1; `benchmarks.pages` compares.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ import shapeenh as se
 
 QUICK = bool(os.environ.get("BENCHMARKS_QUICK"))
 RESULTS = Path(__file__).parent / "results" / ("quick" if QUICK else "")
+FRESH = {"BENCHMARKS_FRESH_MEMORY": "1"}
+KEPT = not FRESH.items() <= os.environ.items() and se.keep_memory()
 
 
 def measure(calls: dict, *, repeats: int = 9, seconds: float = 20.0) -> dict[str, dict[str, float]]:
@@ -70,6 +73,7 @@ def machine() -> dict:
         "python": platform.python_version(),
         "jax": jax.__version__,
         "numpy": np.__version__,
+        "memory": "kept" if KEPT else "fresh",
     }
 
 

@@ -77,9 +77,10 @@ def gradients(found: dict) -> str:
 
 
 def pages(found: dict) -> str:
-    """A row per call."""
-    rows = [[r["call"], ms(r["ms"]), ms(r["ms with large pages"]), f"{r['ratio']:.2f}"] for r in found["rows"]]
-    return markdown(["call", "ms", "with large pages", "ratio"], rows)
+    """A row per call, a column per setting."""
+    settings = [name for name in found["rows"][0] if name not in ("call", "ratio")]
+    rows = [[r["call"], *(ms(r[name]) for name in settings), f"{r['ratio']:.2f}"] for r in found["rows"]]
+    return markdown(["call", *(f"{name}, ms" for name in settings), "kept / fresh"], rows)
 
 
 TABLES = {

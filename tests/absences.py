@@ -335,4 +335,5 @@ NOT_NUMERIC = {
     "made by NumPy on the host": "carved_knot plane sphere torus procedural_sky procedural_studio curvature_legend",
     "display alone": "line_integral_convolution",
     "look-ups by name": "fit_radius named_material style_brush style_footprint",
+    "settings": "keep_memory",
 }

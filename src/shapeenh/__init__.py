@@ -41,6 +41,7 @@ from shapeenh.lines.fields import fit_radius, line_field, make_line_field
 from shapeenh.lines.noise import surface_noise
 from shapeenh.lines.profile import fit_profile
 from shapeenh.lines.styles import style_brush, style_footprint
+from shapeenh.memory import keep_memory
 from shapeenh.pipeline import enhance, render
 from shapeenh.scene.camera import frame_mesh, orthographic_camera, perspective_camera
 from shapeenh.scene.curvature import vertex_curvature
@@ -115,6 +116,7 @@ __all__ = [
     "gbuffer_from_points",
     "harmonic_radiance",
     "interpolate",
+    "keep_memory",
     "line_field",
     "line_integral_convolution",
     "lit_sphere",

@@ -72,7 +72,8 @@ def _assemble(first, *arguments, **options) -> LineField:
     else:
         always = unknown_truth(*jax.tree.leaves(arguments))
         call = lambda function, *values, **options: stored(always, partial(function, **options), *values)  # noqa: E731
-    planes, (link_x, link_y), time, known = call(first, *arguments, **options)
+    planes, insulated, time, known = call(first, *arguments, **options)
+    link_x, link_y = lax.stop_gradient(insulated)
     if not (is_concrete(time) and float(time[0, 0]) == 0):
         planes = [_diffused(plane, link_x, link_y, time) for plane in planes]  # a loop is a border, too
     height, direction, around, flags = call(_directions, planes, known, time)
