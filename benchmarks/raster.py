@@ -1,11 +1,12 @@
 """Visibility, barycentrics, G-buffer, gradients and multisampling, beside the peers that are installed.
 
     python -m benchmarks.raster [MESH ...] [--sizes 800x600 ...] [--subdivide 0 1 ...] [--zoom 1 3] [--cores 2 1]
-                                [--prototype FOLDER] [--all]
+                                [--prototype FOLDER] [--all] [--add]
 
 Without MESH: the embedded object, or bunny.obj (with --all armadillo.obj too) where SHAPEENH_DATA names a folder that
 has them. By default each mesh and its first subdivision, the latter at the first size only. `--all` takes subdivisions
-up to 6 million triangles and sizes up to 3840x2160, and two hours or more.
+up to 6 million triangles and sizes up to 3840x2160, and two hours or more; in pieces, `--add` keeps the rows of other
+scenes in the results that are there.
 
 All calls of a scene are timed in turns, so that a slow phase of the machine hits all alike; `first_ms` is compiling and
 running. One process per number of cores: the second finds what the first compiled in a temporary cache, so its
@@ -57,6 +58,7 @@ from shapeenh.types import replace
 
 LARGEST = 7_000_000  # triangles
 OURS = "shapeenh"
+SCENE = ("cores", "mesh", "triangles", "size", "covered")
 
 # ------------------------------------------------------------------------------------------- scenes
 
@@ -214,6 +216,19 @@ def run_workers(options) -> dict:
     return found
 
 
+def add(found: dict, file: Path) -> dict:
+    """What was found, and what the file has of other scenes, calls and peers."""
+    keys = (*SCENE, "call", "by")
+    there = json.loads(file.read_text()) if file.exists() else {"rows": []}
+    new = {tuple(row[k] for k in keys) for row in found["rows"]}
+    kept = [row for row in there["rows"] if tuple(row[k] for k in keys) not in new]
+    return {
+        "rows": sorted(kept + found["rows"], key=lambda row: (-row["cores"], row["mesh"], row["triangles"])),
+        "missing": found["missing"],
+        "memory": found["memory"] or there.get("memory", {}),
+    }
+
+
 # ------------------------------------------------------------------------------------------- what is told
 
 
@@ -247,7 +262,7 @@ def plot(rows: list[dict]) -> Path | None:
 
 def ratios(rows: list[dict]) -> list[dict]:
     """Per scene and call: a peer's time over ours, of the same run."""
-    keys = ("cores", "mesh", "triangles", "size", "covered", "call")
+    keys = (*SCENE, "call")
     ours = {tuple(r[k] for k in keys): r["median_ms"] for r in rows if r["by"] == OURS}
     out: dict[tuple, dict] = {}
     for r in rows:
@@ -287,6 +302,7 @@ def main() -> None:
     parser.add_argument("--prototype", metavar="FOLDER")
     parser.add_argument("--no-peers", action="store_true")
     parser.add_argument("--all", action="store_true")
+    parser.add_argument("--add", action="store_true", help="to the results that are there")
     parser.add_argument("--worker", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--file", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -303,6 +319,8 @@ def main() -> None:
         worker(options)
         return
     found = run_workers(options)
+    if options.add:
+        found = add(found, RESULTS / "raster.json")
     print(table(ratios(found["rows"])))
     for name, why in found["missing"].items():
         print(f"not here: {name} ({why})")
