@@ -9,6 +9,8 @@ fit together without a hole or a double hit. The near plane itself is a bound on
 
 from __future__ import annotations
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -37,10 +39,15 @@ def cast(value, dtype):
     return lax.convert_element_type(value, dtype)
 
 
-def homogeneous(position, xyr, m, near, shift, height, width):
-    """Float64 [8, 3, n] of world positions [3, 3, n]: homogeneous window coordinates x, y, w; the same with corners
-    that can be snapped in their place, w = 1; nearness times the latter w; depth beyond the near plane."""
-    cx, cy, c, w = sum(m[:, k, None, None] * position[k][None] for k in range(3)) + m[:, 3, None, None]
+def clip(position, m):
+    """Float64 [4, 3, n], x, y, nearness and w, of world positions [3, 3, n]."""
+    return sum(m[:, k, None, None] * position[k][None] for k in range(3)) + m[:, 3, None, None]
+
+
+def homogeneous(clipped, xyr, near, shift, height, width):
+    """Float64 [8, 3, n] of `clip`'s: homogeneous window coordinates x, y, w; the same with corners that can be snapped
+    in their place, w = 1; nearness times the latter w; depth beyond the near plane."""
+    cx, cy, c, w = clipped
     half_x, half_y = width * ONE / 2, height * ONE / 2
     free = [(cx + w) * half_x - w * (ONE // 2), (w - cy) * half_y - w * (ONE // 2), w]
     at = snapped(xyr)
@@ -83,8 +90,8 @@ def integer_edges(abc, mixed, xyr):
 
 
 def visible_box(free, depth, xyr, height, width):
-    """First and last pixel column and row that the part in front of the near plane can touch: front corners, and the
-    points where edges cross the plane (those with a pixel's margin)."""
+    """[4, n] int32: first and last pixel column and row that the part in front of the near plane can touch: front
+    corners, and the points where edges cross the plane (those with a pixel's margin)."""
     front = xyr[0] != BEHIND
     gap = depth[FROM] - depth[TO]
     t = jnp.clip(depth[FROM] / jnp.where(gap == 0, 1.0, gap), 0.0, 1.0)
@@ -100,12 +107,12 @@ def visible_box(free, depth, xyr, height, width):
                 high = jnp.where(valid[corner], jnp.maximum(high, point[corner] + margin), high)
         box.append(cast(jnp.ceil(jnp.clip(low, 0.0, float(LIMIT)) / ONE), I32))
         box.append(cast(jnp.floor(jnp.clip(high, -float(ONE), (size - 1.0) * ONE) / ONE), I32))
-    return box
+    return jnp.stack(box)
 
 
-def tile_box(points, abc, xyr, even, valid, height, width, cull):
+def tile_box(box, points, abc, even, valid, cull):
     """[4, n] int32: first tile column and row, number of columns, number of tiles; none where nothing is drawn."""
-    x0, x1, y0, y1 = visible_box(points[:3], points[7], xyr, height, width)
+    x0, x1, y0, y1 = box
     area = signed_area(abc, points[3:6])
     finite = jnp.isfinite(jnp.sum(points, axis=(0, 1)))
     drawn = valid & finite & faces_viewer(jnp.where(even, area, -area), cull) & (x1 >= x0) & (y1 >= y0)
@@ -137,18 +144,22 @@ def draw_tiles(keys, vertices, face, index, xyr, even, valid, m, near, shift, *,
     always = unknown_truth(vertices, m, face)
     m, wide_near, wide_shift = cast(m, F64), cast(near, F64), cast(shift, F64)
 
-    def points(index, xyr, m, near, shift):
+    def clipped(index, m):
         position = take(vertices.reshape(-1), index[None] * 3 + np.arange(3, dtype=np.int32)[:, None, None])
-        return homogeneous(cast(position, F64), xyr, m, near, shift, height, width)
+        return clip(cast(position, F64), m)
 
-    point = apart(always, points, index, xyr, m, wide_near, wide_shift)
+    def points(clipped, xyr, near, shift):
+        return homogeneous(clipped, xyr, near, shift, height, width)
+
+    point = apart(always, points, apart(always, clipped, index, m), xyr, wide_near, wide_shift)
     abc = apart(always, lines, point[3:6])
     edges = apart(always, integer_edges, abc, point[3:6], xyr)
 
-    def boxes(point, abc, xyr, even, valid):
-        return tile_box(point, abc, xyr, even, valid, height, width, cull)
+    def boxes(point, xyr):
+        return visible_box(point[:3], point[7], xyr, height, width)
 
-    box = apart(always, boxes, point, abc, xyr, even, valid)
+    box = apart(always, boxes, point, xyr)
+    box = apart(always, functools.partial(tile_box, cull=cull), box, point, abc, even, valid)
     plane = apart(always, nearness_lines, point, abc)
     limits = apart(always, nearness_range, xyr, near, shift)
     ends = jnp.cumsum(box[3], dtype=jnp.int32)
