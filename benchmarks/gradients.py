@@ -2,8 +2,9 @@
 
 Each stage on the finished results of those before it, under `jit`: the value of a loss (the mean square of what the
 stage makes), and that value together with its gradient in what is named. Both are the general variants, which a
-derivative needs; called directly, a stage may skip more (docs/skipping.md). Without a mesh: armadillo.obj of the folder
-SHAPEENH_DATA where there is one, else the embedded knot. The goal is a ratio of 3.
+derivative needs; called directly, a stage may skip more (docs/skipping.md). Memory is kept (`shapeenh.keep_memory`),
+but with --fresh. Without a mesh: armadillo.obj of the folder SHAPEENH_DATA where there is one, else the embedded knot.
+The goal is a ratio of 3.
 """
 
 from __future__ import annotations
@@ -133,7 +134,9 @@ def main() -> None:
     parser.add_argument("mesh", nargs="?", type=Path)
     parser.add_argument("--size", default="800x600")
     parser.add_argument("--lights", type=int, default=54)
+    parser.add_argument("--fresh", action="store_true", help="every call in new memory")
     arguments = parser.parse_args()
+    kept = not arguments.fresh and se.keep_memory()
     width, height = (int(n) for n in arguments.size.split("x"))
     paths = [arguments.mesh] if arguments.mesh else []
     name, mesh = next(iter(harness.meshes(paths, ("armadillo",)).items()))
@@ -159,7 +162,7 @@ def main() -> None:
         f"{frames['also vertices, normals']:.1f} times in vertices and normals too. "
         + (f"More than {GOAL:g} times: {', '.join(over)}." if over else f"No stage takes more than {GOAL:g} times.")
     )
-    facts = {"mesh": name, "size": arguments.size, "lights": arguments.lights}
+    facts = {"mesh": name, "size": arguments.size, "lights": arguments.lights, "memory": "kept" if kept else "fresh"}
     print(harness.write("gradients", rows, answer=said, **facts))
     print(said)
 

@@ -2,8 +2,7 @@
 and maps.
 
 With the environment variable BENCHMARKS_QUICK (`python -m benchmarks --quick` sets it) everything is timed three times
-at most, and results go to a folder of their own: a rough look, and a test that every script runs. Memory is kept
-(`shapeenh.keep_memory`), for peers as for us, but with BENCHMARKS_FRESH_MEMORY=1; `benchmarks.pages` compares.
+at most, and results go to a folder of their own: a rough look, and a test that every script runs.
 """
 
 from __future__ import annotations
@@ -24,8 +23,6 @@ import shapeenh as se
 
 QUICK = bool(os.environ.get("BENCHMARKS_QUICK"))
 RESULTS = Path(__file__).parent / "results" / ("quick" if QUICK else "")
-FRESH = {"BENCHMARKS_FRESH_MEMORY": "1"}
-KEPT = not FRESH.items() <= os.environ.items() and se.keep_memory()
 
 
 def measure(calls: dict, *, repeats: int = 9, seconds: float = 20.0) -> dict[str, dict[str, float]]:
@@ -73,7 +70,6 @@ def machine() -> dict:
         "python": platform.python_version(),
         "jax": jax.__version__,
         "numpy": np.__version__,
-        "memory": "kept" if KEPT else "fresh",
     }
 
 

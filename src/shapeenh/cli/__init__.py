@@ -9,7 +9,6 @@ import warnings
 from shapeenh.cli import fit, lines, render
 from shapeenh.cli.terminal import one_line, show_warning, use_compilation_cache
 from shapeenh.cli.values import UsageError
-from shapeenh.memory import keep_memory
 
 COMMANDS = (render, lines, fit)
 
@@ -31,8 +30,6 @@ def main(argv: list[str] | None = None) -> int:
         try:
             arguments = parser.parse_args(argv)
             use_compilation_cache()
-            if argv is None:  # a process of our own
-                keep_memory()
             arguments.run(arguments)
         except (UsageError, ValueError, OSError) as error:
             print(f"shapeenh: error: {one_line(error)}", file=sys.stderr)
