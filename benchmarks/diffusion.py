@@ -7,7 +7,8 @@ the depth gradient of the armadillo and its silhouettes. `explicit` and `fast` e
 flow (a converged Chebyshev expansion in float64), those `to a Gaussian` against the continuous heat flow on the open
 rectangle (spectrally); all rms, as a fraction of the input's. The plot: milliseconds against error, a point per sigma.
 `reverse`: value and gradient of a scalar, as multiples of the value's time; with respect to the conductance of all
-pixels, and of those on the flanks of silhouettes, where it is neither 0 nor 1, as `describe` does it.
+pixels, and of those on the flanks of silhouettes, where it is neither 0 nor 1, as `describe` does it. Memory is kept
+(`shapeenh.keep_memory`).
 """
 
 from __future__ import annotations
@@ -84,6 +85,7 @@ def reverse(scene: str, plane, conductance, sigma: float) -> list[dict]:
 
 
 def main(quick: bool) -> None:
+    kept = se.keep_memory()
     rows: list[dict] = []
     backward: list[dict] = []
     for scene, (u, c) in scenes(600, 800).items():
@@ -118,7 +120,7 @@ def main(quick: bool) -> None:
         f"Default: the fast scheme. At sigma 8 it takes 1/{speed:g} of the time of explicit steps or less, at an error "
         f"of {100 * error:.2g} % of the input or less; below sigma 2 steps are as fast and exact."
     )
-    write("diffusion", rows, reverse=backward, answer=said)
+    write("diffusion", rows, reverse=backward, answer=said, memory="kept" if kept else "fresh")
     print(said)
     series: dict[str, list[tuple]] = {}
     for row in rows:
