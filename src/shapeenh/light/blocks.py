@@ -65,23 +65,20 @@ def read(image, ids):
     return jnp.moveaxis(found.reshape(-1, PIXELS, channels), 2, 1)
 
 
-def _scatter(operation, image, ids, values):
+def write(image, ids, values):
+    """`image` [H, W, C] with the blocks `values` [blocks, C, 64] written; one that is named twice has one value, one
+    beyond the image (`beyond`) is dropped."""
     values = jnp.moveaxis(values, 1, 2).reshape(-1, SIDE, SIDE, image.shape[2])
     numbers = lax.ScatterDimensionNumbers(
         update_window_dims=(1, 2, 3), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1)
     )
-    mode = lax.GatherScatterMode.PROMISE_IN_BOUNDS
-    return operation(image, _corner(ids, image.shape[1]), values, numbers, mode=mode)
+    mode = lax.GatherScatterMode.FILL_OR_DROP
+    return lax.scatter(image, _corner(ids, image.shape[1]), values, numbers, mode=mode)
 
 
-def write(image, ids, values):
-    """`image` [H, W, C] with the blocks `values` [blocks, C, 64] written; a block that is named twice has one value."""
-    return _scatter(lax.scatter, image, ids, values)
-
-
-def add(image, ids, values):
-    """`image` [H, W, C] with the blocks `values` [blocks, C, 64] added."""
-    return _scatter(lax.scatter_add, image, ids, values)
+def beyond(image) -> int:
+    """The number of a block that the image does not have."""
+    return image.shape[0] * image.shape[1] // PIXELS
 
 
 def least(values):

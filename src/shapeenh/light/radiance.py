@@ -12,7 +12,7 @@ from shapeenh import checks
 from shapeenh.fusion import stored
 from shapeenh.light import brdf, sums, warp
 from shapeenh.light.scaling import check_strengths
-from shapeenh.light.weights import Model, gain
+from shapeenh.light.weights import Model, by_lobe, gain
 from shapeenh.types import Descriptor, GBuffer, Lights, Material
 
 # ------------------------------------------------------------------------------------------- what a pixel brings
@@ -40,7 +40,7 @@ def _prologue(model: Model, inputs, on):
         det = a * c - b * b
         factor = det * jnp.exp(-inputs["contrast"][:, 0] * jnp.log(det))  # J's factor, and eq. 3
     if model.scaled:
-        strengths = {f"gamma_{lobe}": inputs[f"gamma_{lobe}"][:, 0] for lobe in _lobes(model)}
+        strengths = {name: inputs[name][:, 0] for name in by_lobe(model, "gamma")}
         mean, half = 0.5 * xx + 0.5 * yy, 0.5 * xx - 0.5 * yy
         # Off the mask inputs are 0, and sigma would be 0/0 there.
         planes["invariant"] = jnp.where(inputs["invariant"][:, 0] > 0, inputs["invariant"][:, 0], 0.5)
@@ -73,10 +73,6 @@ def _prologue(model: Model, inputs, on):
     return planes, (diffuse * (1 - specular), specular * peak, (1 - specular) * peak)
 
 
-def _lobes(model: Model) -> tuple[str, ...]:
-    return ("diffuse", "specular") if model.glossy else ("diffuse",)
-
-
 def _inverse_tensor(xx, xy, yy, convex, concave):
     tensor = warp.spectral(jnp.stack([xx, xy, yy], axis=-1), convex, concave)
     return tensor[..., 0], tensor[..., 1], tensor[..., 2]
@@ -97,9 +93,9 @@ def _reach(model: Model) -> tuple[tuple[str, tuple[str, ...]], ...]:
         table |= {"alpha": (*tensor, *bend)}
     if model.scaled and model.anisotropic:
         table |= {"anisotropy": bend, "concave": (*tensor, *bend, "concave"), "hessian": (*tensor, *bend, "mean")}
-        table |= {name: (name,) for name in (f"gamma_{lobe}" for lobe in _lobes(model))}
+        table |= {name: (name,) for name in by_lobe(model, "gamma")}
     elif model.scaled:
-        gains = tuple(f"gain_{lobe}" for lobe in _lobes(model))
+        gains = by_lobe(model, "gain")
         table |= {"concave": (*tensor, *gains), "hessian": (*tensor, *gains)}
         table |= {f"gamma_{name[5:]}": (name,) for name in gains}
     else:

@@ -145,6 +145,11 @@ def _weights(model: kernel.Model, on, planes, rows):
     if model.glossy:
         log = lambda form, light: kernel.logarithm(kernel.meet(model, form, light).cos_half)  # noqa: E731
         known = known | {"log": made(log, known)}
+    if model.anisotropic:
+        known = known | {"curvature": made(functools.partial(kernel.curvature, model), known)}
+        for lobe in kernel.lobes(model):
+            strength = lambda form, light, lobe=lobe: kernel.gain(form[f"gamma_{lobe}"] * kernel.weighed(form))  # noqa: E731
+            known = known | {f"gain_{lobe}": made(strength, known)}
     return known, made(functools.partial(kernel.weights, model), known)
 
 
@@ -286,9 +291,9 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
         images, constants, light_bar = found
         ids = lax.dynamic_slice_in_dim(walk.ids, i * group, group)
         pixels, valid = stored(on, lambda ids: _read_inputs(inputs, mask, ids), ids)
-        # The list's padding repeats a block, whose cotangent counts once: so the repetitions add 0 below.
-        fresh = (i * group + lane < walk.total)[:, None, None]
-        given = jnp.where(valid & fresh, blocks.read(cotangent, ids), 0)
+        # The list's padding repeats a block, whose cotangent counts once.
+        fresh = i * group + lane < walk.total
+        given = jnp.where(valid & fresh[:, None, None], blocks.read(cotangent, ids), 0)
         planes, rest = stored(on, lambda pixels: _plane_array(plan, on, pixels), pixels)
         zero = jnp.zeros((group, 3, blocks.PIXELS), planes.dtype)
         sums = (zero,) * plan.model.components
@@ -358,7 +363,8 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
             return {name: jnp.where(valid, bar, 0) for name, bar in pull((planes_bar, rest_bar))[0].items()}
 
         bars = stored(on, finish, pixels, planes_bar, sums, given)
-        images = {name: blocks.add(image, ids, bars[name]) for name, image in images.items()}
+        once = jnp.where(fresh, ids, blocks.beyond(mask))
+        images = {name: blocks.write(image, once, bars[name]) for name, image in images.items()}
         constants = {name: value + jnp.sum(bars[name], axis=0) for name, value in constants.items()}
         return images, constants, light_bar
 

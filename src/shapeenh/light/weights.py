@@ -67,17 +67,21 @@ def terms(model: Model) -> dict[str, tuple[tuple[str, str], ...]]:
     if model.scaled:
         table["invariant"] = (("invariant", "one"),)
         if model.anisotropic:
-            table |= {name: ((name, "one"),) for name in _by_lobe(model, "gamma")}
+            table |= {name: ((name, "one"),) for name in by_lobe(model, "gamma")}
             table["concave"] = (("concave", "one"),)
             table["mean"] = (("mean", "one"),)
             table["bend"] = tuple((f"r{s}", s) for s in square)
         else:
-            table |= {name: ((name, "one"),) for name in _by_lobe(model, "gain")}
+            table |= {name: ((name, "one"),) for name in by_lobe(model, "gain")}
     return table
 
 
-def _by_lobe(model: Model, what: str) -> tuple[str, ...]:
-    return (f"{what}_diffuse", f"{what}_specular")[: 1 + model.glossy]
+def lobes(model: Model) -> tuple[str, ...]:
+    return ("diffuse", "specular")[: 1 + model.glossy]
+
+
+def by_lobe(model: Model, what: str) -> tuple[str, ...]:
+    return tuple(f"{what}_{lobe}" for lobe in lobes(model))
 
 
 def planes_of(model: Model) -> tuple[str, ...]:
@@ -203,13 +207,13 @@ def meet(model: Model, form: dict, light: dict) -> Meeting:
 
 
 def weights(model: Model, form: dict, light: dict):
-    """(A, B, C) of the module's docstring, or (A,); of glossy models the forms contain log(n.h)."""
+    """(A, B, C) of the module's docstring, or (A,); the forms contain log(n.h) of glossy models, of anisotropic
+    ones the curvature and the gains."""
     at = meet(model, form, light)
     lit = at.cos_light * at.j
     diffuse = (1 - _fifth(1 - 0.5 * at.cos_light)) * lit
     if model.scaled:
-        gain_diffuse, gain_specular = _gains(model, form, at.j)
-        diffuse = diffuse * scaling(gain_diffuse, jnp.minimum(at.cos_light, 1), form["invariant"])
+        diffuse = diffuse * scaling(form["gain_diffuse"], jnp.minimum(at.cos_light, 1), form["invariant"])
     if not model.glossy:
         return (diffuse,)
     log = form["log"]
@@ -218,35 +222,35 @@ def weights(model: Model, form: dict, light: dict):
     top = jnp.maximum(jnp.maximum(at.cos_light, form["cos_view"]), tiny)
     specular = exponential(jnp.minimum(form["shininess"] * log, 0)) * lit * at.inverse / top
     if model.scaled:
-        specular = specular * scaling(gain_specular, jnp.minimum(at.cos_half, 1), form["invariant"])
+        specular = specular * scaling(form["gain_specular"], jnp.minimum(at.cos_half, 1), form["invariant"])
     return diffuse, specular, specular * _fifth(1 - at.half_view)
 
 
-def _kappa(form: dict, j):
-    """(tanh of the curvature that the direction sees, the same weighed: concavities may have their own strength)."""
-    kappa = jnp.tanh(form["mean"] + form["bend"] * j)
-    return kappa, jnp.where(kappa > 0, form["concave"] * kappa, kappa)
+def curvature(model: Model, form: dict, light: dict):
+    """tanh of the curvature that the direction of the light sees, of anisotropic models."""
+    return jnp.tanh(form["mean"] + form["bend"] * meet(model, form, light).j)
 
 
-def _gains(model: Model, form: dict, j):
-    """Of the diffuse and of the specular lobe, None where there is none."""
-    if not model.anisotropic:
-        return form["gain_diffuse"], form.get("gain_specular")
-    _, kappa = _kappa(form, j)
-    return gain(form["gamma_diffuse"] * kappa), gain(form["gamma_specular"] * kappa) if model.glossy else None
+def weighed(form: dict):
+    """The curvature, where it is concave times its own strength."""
+    return jnp.where(form["curvature"] > 0, form["concave"] * form["curvature"], form["curvature"])
 
 
 # ------------------------------------------------------------------------------------------- their derivatives
 
 
 def _scaling_slopes(gain, delta, invariant):
-    """Derivatives of log sigma with respect to log E, delta and a."""
+    """Derivatives of log sigma with respect to log E, delta and a: with A and B of `scaling`,
+
+    d log sigma = [E (A^2 - B^2) d log E + (1 - E^2) (a (1 - a) d delta - delta (1 - delta) d a)] / ((A E + B)(A + B E))
+    """
     a, b = invariant * (1 - delta), (1 - invariant) * delta
-    above, below = 1 / (a * gain + b), 1 / (a + b * gain)
+    over = 1 / ((a * gain + b) * (a + b * gain))
+    bent = (1 - gain) * (1 + gain) * over
     return (
-        gain * (a * above - b * below),
-        ((1 - invariant) - invariant * gain) * above - ((1 - invariant) * gain - invariant) * below,
-        ((1 - delta) * gain - delta) * above - ((1 - delta) - delta * gain) * below,
+        gain * (a - b) * (a + b) * over,
+        bent * (invariant * (1 - invariant)),
+        -bent * (delta * (1 - delta)),
     )
 
 
@@ -273,10 +277,9 @@ def adjoint(model: Model, form: dict, light: dict, given, along):
     fourth = _fourth(x)
     slope = (1 - fourth * x + 2.5 * cos_light * fourth) * at.j
     if model.scaled:
-        gain_diffuse, gain_specular = _gains(model, form, at.j)
         clamped = jnp.minimum(cos_light, 1)
-        slope = slope * scaling(gain_diffuse, clamped, form["invariant"])
-        by_gain, by_delta, by_invariant = _scaling_slopes(gain_diffuse, clamped, form["invariant"])
+        slope = slope * scaling(form["gain_diffuse"], clamped, form["invariant"])
+        by_gain, by_delta, by_invariant = _scaling_slopes(form["gain_diffuse"], clamped, form["invariant"])
         gain_bar, bar["invariant"] = whole * by_gain, whole * by_invariant  # of log E, and of a
     light_bar = along_diffuse * slope + (whole * by_delta if model.scaled else 0)
     view_bar = log_half_view = nothing
@@ -292,7 +295,7 @@ def adjoint(model: Model, form: dict, light: dict, given, along):
         half_slope = form["shininess"]  # d log B / d log n.h
         if model.scaled:
             clamped = jnp.minimum(at.cos_half, 1)
-            by_gain, by_delta, by_invariant = _scaling_slopes(gain_specular, clamped, form["invariant"])
+            by_gain, by_delta, by_invariant = _scaling_slopes(form["gain_specular"], clamped, form["invariant"])
             half_gain_bar, bar["invariant"] = peak * by_gain, bar["invariant"] + peak * by_invariant
             half_slope = half_slope + by_delta * jnp.where(at.cos_half < 1, at.cos_half, 0)
         # One quotient serves 1/(n.l + n.e) and 1/n.l.
@@ -308,7 +311,7 @@ def adjoint(model: Model, form: dict, light: dict, given, along):
 
     # The gains E, whose curvature may see the light.
     if model.scaled and model.anisotropic:
-        plain, kappa = _kappa(form, at.j)
+        plain, kappa = form["curvature"], weighed(form)
         bar["gamma_diffuse"] = gain_bar * kappa
         inner = gain_bar * form["gamma_diffuse"]
         if model.glossy:
@@ -319,9 +322,9 @@ def adjoint(model: Model, form: dict, light: dict, given, along):
         bar["mean"], bar["bend"] = inner, inner * at.j
         log_j = log_j + inner * form["bend"] * at.j
     elif model.scaled:
-        bar["gain_diffuse"] = gain_bar / gain_diffuse
+        bar["gain_diffuse"] = gain_bar / form["gain_diffuse"]
         if model.glossy:
-            bar["gain_specular"] = half_gain_bar / gain_specular
+            bar["gain_specular"] = half_gain_bar / form["gain_specular"]
 
     # The geometry.
     if not model.warped:
