@@ -78,9 +78,10 @@ def gradients(found: dict) -> str:
 
 def pages(found: dict) -> str:
     """A row per call, a column per setting."""
-    settings = [name for name in found["rows"][0] if name not in ("call", "ratio")]
-    rows = [[r["call"], *(ms(r[name]) for name in settings), f"{r['ratio']:.2f}"] for r in found["rows"]]
-    return markdown(["call", *(f"{name}, ms" for name in settings), "kept / fresh"], rows)
+    ratios = {"ratio": "kept / fresh", "wide_ratio": "wide / kept"}
+    settings = [name for name in found["rows"][0] if name not in ("call", *ratios)]
+    rows = [[r["call"], *(ms(r[n]) for n in settings), *(f"{r[n]:.2f}" for n in ratios)] for r in found["rows"]]
+    return markdown(["call", *(f"{name}, ms" for name in settings), *ratios.values()], rows)
 
 
 TABLES = {

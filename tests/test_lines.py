@@ -320,6 +320,22 @@ def test_a_small_object_in_a_large_frame_has_the_lines_of_the_frame_cut_to_it(ki
         assert len(np.unique(np.asarray(ours)[around])) == 1
 
 
+def test_lines_of_a_small_object_in_a_large_frame_in_float64(x64):
+    row, col = np.mgrid[0:240, 0:328].astype(float) - np.reshape([70, 93], (2, 1, 1))
+    radius = np.hypot(row, col)
+    z = np.where(radius < 24, 4 * np.cos(radius / 3), np.nan)
+    found = []
+    for dtype in (np.float64, np.float32):
+        gbuffer = se.gbuffer_from_height(jnp.asarray(z, dtype))
+        assert list_tiles(gbuffer.mask, 8) is not None
+        field = se.line_field("valley", gbuffer, se.describe(gbuffer))
+        profile = se.fit_profile(field, radius=3.0, least=0.02)
+        found.append((field.height, profile.height, se.draw_lines(profile, field, se.Brush(low=0.02, high=0.1))))
+    assert all(a.dtype == np.float64 and b.dtype == np.float32 for a, b in zip(*found, strict=True))
+    np.testing.assert_allclose(found[1][0], found[0][0], atol=1e-5)
+    assert np.any(np.asarray(found[0][2])[..., 3] > 0.5)
+
+
 @pytest.mark.parametrize(
     ("kind", "sigma"),
     [("luminance", 1.0), ("own", 6.0), *(pytest.param("valley", s, marks=pytest.mark.slow) for s in (1.0, 6.0))],

@@ -78,7 +78,10 @@ def read(plane, row, col):
     r, c = jnp.clip(row + 1, 0, h - 1), jnp.clip(col + 1, 0, w - 1)
     r0, c0 = jnp.minimum(jnp.floor(r), h - 2), jnp.minimum(jnp.floor(c), w - 2)
     fr, fc = r - r0, c - c0
-    a, b, d, e = _corners(plane, r0.astype(jnp.int32) * w + c0.astype(jnp.int32))
+    # stored: every read of a corner, and every write in reverse mode, would work it out again
+    number = lambda r, c: r.astype(jnp.int32) * w + c.astype(jnp.int32)  # noqa: E731
+    index = stored(unknown_truth(plane), number, *lax.stop_gradient((r0, c0)))
+    a, b, d, e = _corners(plane, index)
     top, bottom = a + fc * (b - a), d + fc * (e - d)
     return top + fr * (bottom - top)
 
@@ -90,13 +93,17 @@ def _places(plane, index):
 @jax.custom_vjp
 def _corners(plane, index):
     """The values at a place and to the right of it, and below both. Gradient: one pass for all four, reverse mode."""
-    return tuple(plane.ravel().at[place].get(mode="promise_in_bounds") for place in _places(plane, index))
+    return tuple(
+        plane.ravel().at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        for place in _places(plane, index)
+    )
 
 
 def _corners_backward(saved, cotangents):
     plane, index = saved
     bar = jnp.zeros_like(plane).ravel()
-    bar = bar.at[jnp.stack(_places(plane, index))].add(jnp.stack(cotangents), mode="promise_in_bounds")
+    for place, cotangent in zip(_places(plane, index), cotangents, strict=True):
+        bar = bar.at[place].add(cotangent, mode="promise_in_bounds", wrap_negative_indices=False)
     return bar.reshape(plane.shape), None
 
 

@@ -226,20 +226,56 @@ def _reach(singular, row, col, theta_x, theta_y, radius: float):
     A bilinear read sees a pixel from 1 px away, so it ends that much before the place where the sum reaches its limit.
     """
     steps = int(np.ceil(radius))
-    step = radius / steps
-    limit = GAMMA_MAX * (1 - 1e-3)
-    t = step * np.arange(-steps, steps + 1)
+    t = radius / steps * np.arange(-steps, steps + 1)
     added = _barrier(_along(singular, row, col, theta_x, theta_y, jnp.asarray(t, row.dtype)))
+    return _until(radius, added)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _until(radius: float, added):
+    """The reach, from what each sample adds, [2 steps + 1, ...]: where the sum from the middle outwards first meets its
+    limit, between two samples. Gradient: reverse mode; by the samples up to there, on the side that ends it."""
+    return _ending(radius, added)[0]
+
+
+def _ending(radius: float, added):
+    """(reach, the number of the sample at which the sum passes the limit, counted from the middle, 0 if none does; the
+    part of that sample which it takes; the inverse of what that sample adds)."""
+    steps = added.shape[0] // 2
+    step, limit = radius / steps, GAMMA_MAX * (1 - 1e-3)
     start = added[steps]
-    reach = jnp.where(start < limit, radius, 0.0).astype(row.dtype)
+    reach = jnp.where(start < limit, radius, 0.0).astype(added.dtype)
+    last, part, inverse = (jnp.zeros_like(reach) for _ in range(3))
     for side in (1, -1):
         total = start
         for i in range(1, steps + 1):
             before, total = total, total + added[steps + side * i]
             crosses = (before < limit) & (total >= limit)
-            part = (limit - before) / jnp.where(crosses, total - before, 1)
-            reach = jnp.where(crosses, jnp.minimum(reach, (i - 1 + part) * step - 1), reach)
-    return reach
+            slope = 1 / jnp.where(crosses, total - before, 1)
+            share = (limit - before) * slope
+            end = (i - 1 + share) * step - 1
+            nearer = crosses & (end < reach)
+            reach, last = jnp.where(nearer, end, reach), jnp.where(nearer, side * i, last)
+            part, inverse = jnp.where(nearer, share, part), jnp.where(nearer, slope, inverse)
+    return reach, last, part, inverse
+
+
+def _until_forward(radius, added):
+    reach, *ending = _ending(radius, added)
+    return reach, (ending, added)
+
+
+def _until_backward(radius, saved, cotangent):
+    ending, added = saved
+    last, part, inverse, cotangent = (a[None] for a in (*ending, cotangent))
+    steps = added.shape[0] // 2
+    number = np.arange(-steps, steps + 1, dtype=added.dtype).reshape(-1, *(1,) * (added.ndim - 1))
+    before = (np.sign(number) * last >= 0) & (np.abs(number) < jnp.abs(last))  # none where last is 0
+    share = jnp.where(number == last, part, before.astype(added.dtype))
+    return (share * (-radius / steps * inverse * cotangent),)
+
+
+_until.defvjp(_until_forward, _until_backward)
 
 
 def least_squares_matrix(samples: int) -> np.ndarray:

@@ -79,9 +79,11 @@ def over_tiles(function, images, tiles, background, *, margin: int, rim=((0, 0),
     shape = np.asarray(jax.tree.leaves(images)[0].shape[:2])
     size = tile + 2 * margin
 
+    def begin(start, image):
+        return *start, *(jnp.int32(0),) * (image.ndim - 2)
+
     def cut(image, start, size):
-        rest = image.ndim - 2
-        return lax.dynamic_slice(image, (*start, *(0,) * rest), (*map(int, size), *image.shape[2:]))
+        return lax.dynamic_slice(image, begin(start, image), (*map(int, size), *image.shape[2:]))
 
     def one(k, out):
         corner = [corners[k, i] for i in (0, 1)]
@@ -90,9 +92,7 @@ def over_tiles(function, images, tiles, background, *, margin: int, rim=((0, 0),
         place = [corner[i] + rim[i][0] for i in (0, 1)]
         found = function(jax.tree.map(lambda image: cut(image, start, size), images))
         return tuple(
-            lax.dynamic_update_slice(
-                whole, cut(part, inner, part.shape[:2] - size + tile), (*place, *(0,) * (part.ndim - 2))
-            )
+            lax.dynamic_update_slice(whole, cut(part, inner, part.shape[:2] - size + tile), begin(place, part))
             for whole, part in zip(out, found, strict=True)
         )
 
