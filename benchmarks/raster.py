@@ -43,6 +43,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 
 import jax
@@ -233,24 +234,23 @@ def add(found: dict, file: Path) -> dict:
 
 
 def plot(rows: list[dict]) -> Path | None:
-    """`results/raster.png`: milliseconds against triangles per peer, ids and G-buffer, first size and cores."""
+    """`results/raster.png`: milliseconds against triangles per peer, ids and G-buffer, at the size with most scenes."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
         print("no plot: matplotlib is missing (pip install shapeenh[bench])")
         return None
-    first = rows[0]
+    scenes = Counter((r["size"], r["cores"]) for r in rows if r["call"] == "ids" and r["by"] == OURS)
+    (size, cores), _ = scenes.most_common(1)[0]
     kinds = ("ids", "G-buffer")
     figure = Figure(figsize=(10, 4.5), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     for axes, kind in zip(panels, kinds, strict=True):
-        chosen = [r for r in rows if r["call"] == kind and r["size"] == first["size"] and r["cores"] == first["cores"]]
+        chosen = [r for r in rows if (r["call"], r["size"], r["cores"]) == (kind, size, cores)]
         for who in dict.fromkeys(r["by"] for r in chosen):
             points = sorted((r["triangles"], r["median_ms"]) for r in chosen if r["by"] == who)
             axes.plot(*zip(*points, strict=True), "o-", label=who, linewidth=3 if who == OURS else 1)
-        axes.set(
-            xscale="log", yscale="log", xlabel="triangles", title=f"{kind}, {first['size']}, {first['cores']} cores"
-        )
+        axes.set(xscale="log", yscale="log", xlabel="triangles", title=f"{kind}, {size}, {cores} cores")
         axes.grid(alpha=0.3, which="both")
         axes.legend(fontsize=8)
     panels[0].set_ylabel("milliseconds")
