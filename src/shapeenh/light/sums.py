@@ -148,8 +148,7 @@ def _weights(model: kernel.Model, on, planes, rows):
     if model.anisotropic:
         known = known | {"curvature": made(functools.partial(kernel.curvature, model), known)}
         for lobe in kernel.lobes(model):
-            strength = lambda form, light, lobe=lobe: kernel.gain(form[f"gamma_{lobe}"] * kernel.weighed(form))  # noqa: E731
-            known = known | {f"gain_{lobe}": made(strength, known)}
+            known = known | {f"gain_{lobe}": made(functools.partial(kernel.anisotropic_gain, lobe), known)}
     return known, made(functools.partial(kernel.weights, model), known)
 
 

@@ -236,6 +236,11 @@ def weighed(form: dict):
     return jnp.where(form["curvature"] > 0, form["concave"] * form["curvature"], form["curvature"])
 
 
+def anisotropic_gain(lobe: str, form: dict, light: dict):
+    """E of a lobe, which depends on the light through the curvature that it sees."""
+    return gain(form[f"gamma_{lobe}"] * weighed(form))
+
+
 # ------------------------------------------------------------------------------------------- their derivatives
 
 

@@ -92,7 +92,7 @@ def _places(plane, index):
 
 @jax.custom_vjp
 def _corners(plane, index):
-    """The values at a place and to the right of it, and below both. Gradient: one pass for all four, reverse mode."""
+    """The values at a place and to the right of it, and below both. Gradient: all four into one plane, reverse mode."""
     return tuple(
         plane.ravel().at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
         for place in _places(plane, index)

@@ -262,16 +262,15 @@ def _ending(radius: float, added):
 
 def _until_forward(radius, added):
     reach, *ending = _ending(radius, added)
-    return reach, (ending, added)
+    return reach, ending
 
 
-def _until_backward(radius, saved, cotangent):
-    ending, added = saved
+def _until_backward(radius, ending, cotangent):
     last, part, inverse, cotangent = (a[None] for a in (*ending, cotangent))
-    steps = added.shape[0] // 2
-    number = np.arange(-steps, steps + 1, dtype=added.dtype).reshape(-1, *(1,) * (added.ndim - 1))
+    steps = int(np.ceil(radius))
+    number = np.arange(-steps, steps + 1, dtype=last.dtype).reshape(-1, *(1,) * (last.ndim - 1))
     before = (np.sign(number) * last >= 0) & (np.abs(number) < jnp.abs(last))  # none where last is 0
-    share = jnp.where(number == last, part, before.astype(added.dtype))
+    share = jnp.where(number == last, part, before.astype(last.dtype))
     return (share * (-radius / steps * inverse * cotangent),)
 
 
