@@ -21,6 +21,12 @@ def is_zero(*values) -> bool:
     return all(is_concrete(v) and not np.any(np.asarray(v)) for v in values)
 
 
+def as_number(value, dtype):
+    """A number, or a few, as an array: by NumPy where it is known, because an eager operation of JAX takes as long as
+    hundreds there, and waits for its turn among those on images."""
+    return np.asarray(value, dtype) if is_concrete(value) else jnp.asarray(value, dtype)
+
+
 def float_dtype(*arrays):
     """float64 where x64 is enabled and an array is float64, float32 for narrower floats, JAX's default without any."""
     given = [np.dtype(a.dtype) for a in arrays if hasattr(a, "dtype")]

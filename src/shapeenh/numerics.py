@@ -147,8 +147,9 @@ def eigenvalues(tensor):
     Gradient: exact off umbilics; at an umbilic the derivative of r is taken as 0, so that every symmetric function of
     (k1, k2) has its exact gradient there.
     """
-    scale = _power_of_two(jnp.max(jnp.abs(tensor), axis=-1))
-    xx, xy, yy = (tensor[..., i] / scale for i in range(3))
+    planes = [tensor[..., i] for i in range(3)]
+    scale = _power_of_two(functools.reduce(jnp.maximum, map(jnp.abs, planes)))
+    xx, xy, yy = (t / scale for t in planes)
     mean = 0.5 * xx + 0.5 * yy
     r = safe_hypot(0.5 * xx - 0.5 * yy, xy)
     large = mean + jnp.where(mean < 0, -r, r)

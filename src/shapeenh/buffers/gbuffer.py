@@ -58,12 +58,14 @@ def render_gbuffer(
     dtype = checks.float_dtype(mesh.vertices, mesh.normals, camera.view, camera.projection)
     vertices, view, projection = (jnp.asarray(a, dtype) for a in (mesh.vertices, camera.view, camera.projection))
     tables = {name: jnp.asarray(table, dtype) for name, table in tables.items()}
-    return resolve_gbuffer(vertices, jnp.asarray(mesh.faces, jnp.int32), tables, view, projection, seen.triangle)
+    mask = seen.triangle >= 0  # on its own, so that who only waits for the mask has it before the fields
+    faces = jnp.asarray(mesh.faces, jnp.int32)
+    return GBuffer(mask=mask, **resolve_gbuffer(vertices, faces, tables, view, projection, seen.triangle))
 
 
 @jax.jit
-def resolve_gbuffer(vertices, faces, tables, view, projection, triangle) -> GBuffer:
-    """The jitted body of `render_gbuffer` behind the visibility, of checked arrays."""
+def resolve_gbuffer(vertices, faces, tables, view, projection, triangle) -> dict:
+    """The fields of `render_gbuffer` but the mask, by name: the jitted body behind the visibility, of checked arrays."""
     names = sorted(tables, key=("normal", "albedo", "uv").index)
     channels = {"depth": 1, "position": 3, **{name: tables[name].shape[1] for name in names}}
     if faces.shape[0] == 0 or vertices.shape[0] == 0:
@@ -72,7 +74,7 @@ def resolve_gbuffer(vertices, faces, tables, view, projection, triangle) -> GBuf
         m, _ = clip_matrix(view, projection)
         made = resolve(SURFACE, vertices, [tables[name] for name in names], view, m, faces, triangle)
     fields = dict(zip(channels, made, strict=True))
-    return GBuffer(mask=triangle >= 0, **{**fields, "depth": fields["depth"][..., 0]})
+    return {**fields, "depth": fields["depth"][..., 0]}
 
 
 # ------------------------------------------------------------------------------------------- what the fields are

@@ -8,7 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shapeenh.checks import check_choice, check_range, check_shape, check_type, float_dtype, is_concrete
+from shapeenh.checks import (
+    as_number,
+    check_choice,
+    check_range,
+    check_shape,
+    check_type,
+    float_dtype,
+    is_concrete,
+)
 from shapeenh.descriptor import diffusion, edges, gradient
 from shapeenh.descriptor.box import covering_part, crop, paste
 from shapeenh.fusion import stored, unknown_truth
@@ -124,17 +132,17 @@ def describe(gbuffer, *, sigma=0.0, foreshortening=1.0, importance=None, creases
         check_range("creases", degrees, 0, 180, open_ends=True)
 
     dtype = float_dtype(gbuffer.normal)
-    as_float = partial(jnp.asarray, dtype=dtype)
+    number = partial(as_number, dtype=dtype)
     smooth = importance is not None or not is_concrete(sigma) or bool(np.asarray(sigma) > 0)
     part = covering_part(gbuffer.mask) if is_concrete(gbuffer.mask) else None
     corner, size = part if part is not None else (None, None)
     return _describe(
         gbuffer,
         corner,
-        as_float(sigma),
-        None if is_concrete(foreshortening) and np.asarray(foreshortening) == 1 else as_float(foreshortening),
-        None if importance is None else as_float(importance),
-        as_float(degrees),
+        number(sigma),
+        None if is_concrete(foreshortening) and np.asarray(foreshortening) == 1 else number(foreshortening),
+        None if importance is None else jnp.asarray(importance, dtype),
+        number(degrees),
         smoothing=_smoothing(sigma, importance, scheme) if smooth else None,
         with_creases=with_creases,
         size=size,

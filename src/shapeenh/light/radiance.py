@@ -147,7 +147,8 @@ def _input(name, value, size, channels, dtype):
     """A number or [channels] as a constant [channels]; a map [H, W] or [H, W, channels] as an image."""
     shape = np.shape(value)
     if shape in ((), (channels,)):
-        return jnp.broadcast_to(jnp.asarray(value, dtype), (channels,))
+        constant = checks.as_number(value, dtype)
+        return np.full((channels,), constant) if checks.is_concrete(value) else jnp.broadcast_to(constant, (channels,))
     if shape in (size, (*size, channels)):
         return jnp.broadcast_to(jnp.asarray(value, dtype).reshape(*size, -1), (*size, channels))
     text = "[]" if channels == 1 else f"[], [{channels}]"
@@ -157,7 +158,7 @@ def _input(name, value, size, channels, dtype):
 def _steps() -> tuple[int, int]:
     """Blocks and lights per step: what stays in a CPU's cache and is yet worth sharing among its cores, or what fills
     an accelerator."""
-    return (256, 8) if jax.default_backend() == "cpu" else (4096, 16)
+    return (512, 8) if jax.default_backend() == "cpu" else (4096, 16)
 
 
 def _prepared_lights(lights, dtype):
@@ -167,16 +168,17 @@ def _prepared_lights(lights, dtype):
     checks.check_finite("lights.direction", lights.direction)
     checks.check_finite("lights.radiance", lights.radiance)
     direction, radiance = lights.direction, lights.radiance
-    if checks.is_concrete(lights):
+    known = checks.is_concrete(lights)
+    if known:
         direction, radiance = np.asarray(direction), np.asarray(radiance)
         shining = np.any(radiance != 0, axis=-1)
         direction, radiance = direction[shining], radiance[shining]
     count = direction.shape[0]
     extra = sums.ladder(count, 8) - count
-    pad = jnp if not checks.is_concrete(lights) else np
-    direction = pad.concatenate([direction, pad.broadcast_to(pad.asarray([0.0, 0.0, 1.0]), (extra, 3))])
-    radiance = pad.concatenate([radiance, pad.zeros((extra, 3))])
-    return jnp.asarray(direction, dtype), jnp.asarray(radiance, dtype), jnp.asarray(count, jnp.int32)
+    numpy = np if known else jnp
+    direction = numpy.concatenate([direction, numpy.broadcast_to(numpy.asarray([0.0, 0.0, 1.0]), (extra, 3))])
+    radiance = numpy.concatenate([radiance, numpy.zeros((extra, 3))])
+    return numpy.asarray(direction, dtype), numpy.asarray(radiance, dtype), np.int32(count)
 
 
 def _check_descriptor(descriptor, gbuffer):

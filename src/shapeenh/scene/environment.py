@@ -277,9 +277,11 @@ def _rotation_matrix(rotation, dtype):
     return rotation
 
 
+@jax.jit
 def _rotate(direction, matrix):
+    """Directions [N, 3] turned by the first 3 x 3 of a matrix."""
     # An explicit sum: a matrix product may run in lower precision on accelerators.
-    return jnp.sum(matrix[None] * direction[:, None, :], axis=-1)
+    return jnp.sum(matrix[None, :3, :3] * direction[:, None, :], axis=-1)
 
 
 def rotate_lights(lights: Lights, camera: Camera) -> Lights:
@@ -293,8 +295,8 @@ def rotate_lights(lights: Lights, camera: Camera) -> Lights:
     checks.check_shape("camera.view", camera.view, (4, 4))
     checks.check_shape("lights.direction", lights.direction, (None, 3))
     dtype = checks.float_dtype(lights.direction)
-    matrix = jnp.asarray(camera.view, dtype)[:3, :3]
-    return Lights(direction=_rotate(jnp.asarray(lights.direction, dtype), matrix), radiance=lights.radiance)
+    direction = _rotate(jnp.asarray(lights.direction, dtype), jnp.asarray(camera.view, dtype))
+    return Lights(direction=direction, radiance=lights.radiance)
 
 
 # ------------------------------------------------------------------------------------------- embedded defaults
