@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 SOURCE = Path(__file__).parent.parent / "src" / "shapeenh"
-BASE = ("types", "numerics", "checks", "fusion", "heat", "memory", "sparse")
+BASE = ("types", "numerics", "checks", "fusion", "heat", "memory", "sparse", "wide")
 STAGES = ("codecs", "scene", "buffers", "descriptor", "light", "style", "lines", "fit")
 SEES_ALL = ("pipeline", "cli", "__init__")
 TOUCHES_FILES = ("io", "cli")

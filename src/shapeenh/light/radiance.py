@@ -14,6 +14,7 @@ from shapeenh.light import brdf, sums, warp
 from shapeenh.light.scaling import check_strengths
 from shapeenh.light.weights import Model, by_lobe, gain
 from shapeenh.types import Descriptor, GBuffer, Lights, Material
+from shapeenh.wide import jit_wide
 
 # ------------------------------------------------------------------------------------------- what a pixel brings
 # A prologue turns inputs, planes (block, channel, 64) by name, into the planes of the weights and the factors that stay
@@ -108,7 +109,7 @@ def _reach(model: Model) -> tuple[tuple[str, tuple[str, ...]], ...]:
 # ------------------------------------------------------------------------------------------- the Python layer
 
 
-@functools.partial(jax.jit, static_argnames=("plan",))
+@functools.partial(jit_wide, static_argnames=("plan",))
 def _shade_image(plan, mask, inputs, direction, radiance, count):
     return sums.shade_image(plan, mask, inputs, direction, radiance, count)
 

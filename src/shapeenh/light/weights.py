@@ -175,8 +175,9 @@ class Meeting(NamedTuple):
 
 
 def root(form: dict, light: dict):
-    """t = (w^2 + |T p'|^2)^-1/2, of warped models: part of the forms for what follows."""
-    return lax.rsqrt(light["w"] * light["w"] + form["stretch"])
+    """t = (w^2 + |T p'|^2)^-1/2, of warped models: part of the forms for what follows. By operations that are rounded
+    correctly: `rsqrt` is approximated, in another way for every width of registers."""
+    return jnp.sqrt(1 / (light["w"] * light["w"] + form["stretch"]))
 
 
 def warped_cosine(form: dict, light: dict):
