@@ -15,6 +15,7 @@ import numpy as np
 
 import shapeenh as se
 from benchmarks import harness
+from shapeenh.wide import jit_wide
 
 SIZE = {"height": 600, "width": 800}
 
@@ -50,7 +51,7 @@ def pairs() -> dict[str, tuple]:
     dull = se.Material(stone.diffuse, jnp.zeros(3), stone.shininess)
     sheen = shade(material=se.Material(jnp.zeros(3), jnp.zeros(3), stone.shininess))  # Schlick's, at R_s = 0
     some = lights.radiance.at[::2].set(0)
-    general_warp, general_scale, general_bend = map(jax.jit, (warp, scale, lambda a: scale(anisotropy=a)))
+    general_warp, general_scale, general_bend = map(jit_wide, (warp, scale, lambda a: scale(anisotropy=a)))
     general_describe = jax.jit(lambda g, sigma: se.describe(g, sigma=sigma).hessian)
     plain_describe = jax.jit(lambda g: se.describe(g, sigma=0.0).hessian)
     return {

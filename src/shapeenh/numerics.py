@@ -80,11 +80,12 @@ def _safe_hypot_jvp(primals, tangents):
 
 
 def norm(v, axis: int = -1, keepdims: bool = False):
-    """Euclidean length, scaled against overflow; 0 with gradient 0 for the zero vector (plain norm gives NaN)."""
-    big = jax.lax.stop_gradient(jnp.max(jnp.abs(v), axis=axis, keepdims=True))
+    """Euclidean length of vectors of a few components, scaled against overflow; 0 with gradient 0 for the zero vector
+    (plain norm gives NaN). Component by component: XLA's reductions of short axes are many times slower on CPU."""
+    components = [lax.index_in_dim(v, i, axis) for i in range(v.shape[axis])]
+    big = lax.stop_gradient(functools.reduce(jnp.maximum, map(jnp.abs, components)))
     big = jnp.where(big > 0, big, 1)
-    u = v / big
-    length = safe_sqrt(jnp.sum(u * u, axis=axis, keepdims=True)) * big
+    length = safe_sqrt(sum((t / big) ** 2 for t in components)) * big
     return length if keepdims else jnp.squeeze(length, axis)
 
 

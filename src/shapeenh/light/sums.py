@@ -67,12 +67,12 @@ def _light_table(direction, radiance, rows: int):
     return jnp.concatenate([table, jnp.broadcast_to(dark, (rows + 1 - table.shape[0], dark.shape[1]))])
 
 
-def _seen(low, high, table):
-    """[lights, boxes]: which lights can light some normal of the boxes low..high [3, boxes]."""
-    most = sum(
-        jnp.maximum(table[:, 1 + k, None] * low[None, k], table[:, 1 + k, None] * high[None, k]) for k in range(3)
-    )
-    return most > 0
+def _seen(box, table, first, size: int, count):
+    """[size, boxes]: which of the lights from `first` on can light some normal of the boxes low, high [3, boxes]."""
+    low, high = box
+    part = lax.dynamic_slice_in_dim(table, first, size)[:, :, None]
+    most = sum(jnp.maximum(part[:, 1 + k] * low[None, k], part[:, 1 + k] * high[None, k]) for k in range(3))
+    return (most > 0) & (first + lax.iota(jnp.int32, size) < count)[:, None]
 
 
 def _compact(active, first, dark):
@@ -92,13 +92,9 @@ def _light_loop(plan: Plan, box, table, count, body, carry):
     """`body(carry, numbers, rows)` over chunks of lights that the blocks see: (block, chunk), (block, chunk, 12)."""
     rows = table.shape[0] - 1
     span = min(rows, SPAN)
-    low, high = box
 
     def over_span(i, carry):
-        part = lax.dynamic_slice_in_dim(table, i * span, span)
-        number = i * span + lax.iota(jnp.int32, span)
-        active = _seen(low, high, part) & (number < count)[:, None]
-        lists, lengths = _compact(active, i * span, rows)
+        lists, lengths = _compact(_seen(box, table, i * span, span, count), i * span, rows)
 
         def over_chunk(j, carry):
             numbers = lax.dynamic_slice_in_dim(lists, j * plan.chunk, plan.chunk, axis=1)
@@ -192,10 +188,10 @@ def _plan_walk(plan: Plan, mask, normal, table, count) -> _Walk:
     empty = jnp.zeros((3, ids.shape[0]), normal.dtype)
     low, high = lax.fori_loop(0, -(-total // group), box, (empty, empty))
 
-    def count_light(i, seen):
-        return seen + (_seen(low, high, lax.dynamic_slice_in_dim(table, i, 1))[0]).astype(jnp.int32)
+    def count_lights(i, work):
+        return work + sum(_seen((low, high), table, i * plan.chunk, plan.chunk, count).astype(jnp.int32))
 
-    work = lax.fori_loop(0, count, count_light, jnp.zeros(ids.shape, jnp.int32))
+    work = lax.fori_loop(0, -(-count // plan.chunk), count_lights, jnp.zeros(ids.shape, jnp.int32))
     order, _ = blocks.listed(work, lax.iota(jnp.int32, ids.shape[0]) < total, group)
     return _Walk(ids[order], total, low[:, order], high[:, order])
 
