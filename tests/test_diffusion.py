@@ -51,6 +51,21 @@ def test_explicit_steps_equal_the_plain_loop(dtype, rng):
     np.testing.assert_allclose(got, wanted, atol=1e-5 if dtype == np.float32 else 1e-12)
 
 
+@pytest.mark.parametrize("levels", (-5, 2))
+def test_a_batch_is_what_its_members_are(x64, rng, obstacles, levels):
+    """Of a batch of sigmas each takes its own number of steps and levels, forward and in reverse."""
+    u, c = jnp.asarray(rng.standard_normal((2, *SHAPE))), jnp.asarray(obstacles)
+
+    def value(sigma):
+        return jnp.sum(_run(u, c, 0.5 * jnp.square(sigma)[None, None], levels, False) ** 2)
+
+    sigmas = jnp.asarray([0.4, 1.3, 12.0])
+    together = jax.vmap(value)(sigmas), *jax.vmap(jax.value_and_grad(value))(sigmas)
+    for k, sigma in enumerate(sigmas):
+        wanted = value(sigma), *jax.value_and_grad(value)(sigma)
+        np.testing.assert_allclose([t[k] for t in together], wanted, rtol=1e-9)
+
+
 def test_every_pixel_spends_its_own_budget(x64, rng):
     u, c, steps = rng.standard_normal((9, 11)), rng.random((9, 11)), rng.integers(0, 7, (9, 11)) * 0.2
     got = _run(jnp.asarray(u[None]), jnp.asarray(c), jnp.asarray(steps), -2, True)[0]

@@ -57,3 +57,10 @@ def test_nothing_but_results_is_handed_on():
     program = jax.make_jaxpr(jax.grad(lambda *a: staged(stored, *a), (0, 1)))(*arguments())
     forward = list(conditionals(program))[:2]
     assert [len(e.outvars) for e in forward] == [3, 1]
+
+
+def test_borders_outlast_batches():
+    """Under `vmap` a conditional on a batch of predicates becomes a selection, which is no border."""
+    batch = [jnp.stack([a, 1.5 * a]) for a in arguments()]
+    program = jax.make_jaxpr(jax.vmap(lambda *a: staged(stored, *a)))(*batch)
+    assert len(list(conditionals(program))) == 2

@@ -28,7 +28,18 @@ def unknown_truth(*arrays):
         if jnp.issubdtype(first.dtype, jnp.floating):
             first = lax.bitcast_convert_type(lax.convert_element_type(first, jnp.float32), jnp.int32)
         total = total + lax.convert_element_type(first, jnp.int32)
-    return total >= jnp.iinfo(jnp.int32).min
+    return _truth(total)
+
+
+@jax.custom_batching.custom_vmap
+def _truth(number):
+    return number >= jnp.iinfo(jnp.int32).min
+
+
+@_truth.def_vmap
+def _one_truth(axis_size, in_batched, numbers):
+    """One for all of a batch: of a batch of predicates `vmap` would make selections, which are no borders."""
+    return _truth(jnp.max(numbers)), False
 
 
 def stored(always, function, *args):
