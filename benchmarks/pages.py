@@ -4,8 +4,8 @@ Every call writes its results into memory that the C library has just got from t
 with zeros at its first touch. `keep_memory` makes it keep what is freed. And glibc 2.35 or newer on Linux asks for
 large pages where the environment variable GLIBC_TUNABLES says so before Python starts. No number of a picture changes.
 On processors with AVX-512, XLA uses registers of 512 bits instead of 256 where XLA_FLAGS says so; some operations are
-rounded otherwise then. Calls of the sums over lights that are compiled on their own ask for them anyway. Each setting is timed in a process of its own, in turns. Of the other benchmarks, `benchmarks.gradients` and
-`benchmarks.diffusion` keep memory.
+rounded otherwise then. Sums over lights that are compiled on their own ask for them anyway. Each setting is timed in a
+process of its own, in turns. Of the other benchmarks, `benchmarks.gradients` and `benchmarks.diffusion` keep memory.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ def render_gbuffer(
 
 @jax.jit
 def resolve_gbuffer(vertices, faces, tables, view, projection, triangle) -> dict:
-    """The fields of `render_gbuffer` but the mask, by name: the jitted body behind the visibility, of checked arrays."""
+    """The fields of `render_gbuffer` but the mask: its jitted body behind the visibility, of checked arrays."""
     names = sorted(tables, key=("normal", "albedo", "uv").index)
     channels = {"depth": 1, "position": 3, **{name: tables[name].shape[1] for name in names}}
     if faces.shape[0] == 0 or vertices.shape[0] == 0:

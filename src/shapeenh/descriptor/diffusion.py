@@ -146,6 +146,7 @@ def diffuse_stacks(stacks, conductance, links, budget, flank, always, levels: in
         or more; exactly that many if `sure`); or -n, explicit steps, whose reverse mode keeps n levels of states
         (`heat.depth_for`). most: how many links of a flank are followed.
     """
+
     @jax.custom_batching.sequential_vmap  # of a batch one after the other: each has its own number of steps
     def diffused(stacks, alive, links, budget, always):
         return _diffuse(stacks, links, None, alive, budget, always, levels, sure)
