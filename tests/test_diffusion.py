@@ -51,7 +51,7 @@ def test_explicit_steps_equal_the_plain_loop(dtype, rng):
     np.testing.assert_allclose(got, wanted, atol=1e-5 if dtype == np.float32 else 1e-12)
 
 
-@pytest.mark.parametrize("levels", (-5, 2))
+@pytest.mark.parametrize("levels", [-5, 2])
 def test_a_batch_is_what_its_members_are(x64, rng, obstacles, levels):
     """Of a batch of sigmas each takes its own number of steps and levels, forward and in reverse."""
     u, c = jnp.asarray(rng.standard_normal((2, *SHAPE))), jnp.asarray(obstacles)
