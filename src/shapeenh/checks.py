@@ -21,10 +21,10 @@ def is_zero(*values) -> bool:
     return all(is_concrete(v) and not np.any(np.asarray(v)) for v in values)
 
 
-def as_number(value, dtype):
+def as_number(value, dtype=None):
     """A number, or a few, as an array: by NumPy where it is known, because an eager operation of JAX takes as long as
-    hundreds there, and waits for its turn among those on images."""
-    return np.asarray(value, dtype) if is_concrete(value) else jnp.asarray(value, dtype)
+    hundreds there, and waits for its turn among those on images. An image stays where it is."""
+    return (np if np.ndim(value) < 2 and is_concrete(value) else jnp).asarray(value, dtype)
 
 
 def float_dtype(*arrays):

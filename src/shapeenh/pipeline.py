@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from shapeenh.buffers.borrow import resolve_coverage
 from shapeenh.buffers.coverage import sample_coverage
 from shapeenh.buffers.gbuffer import render_gbuffer
-from shapeenh.checks import check_range, check_size, check_type, is_concrete
+from shapeenh.checks import as_number, check_range, check_size, check_type
 from shapeenh.descriptor.view import describe
 from shapeenh.light.radiance import shade, shade_scaled, shade_warped
 from shapeenh.scene.environment import rotate_lights
@@ -108,7 +107,7 @@ def enhance(
     if enhancement is None:
         return shade(gbuffer, lights, material)
     scale = gbuffer.mask.shape[0] / REFERENCE_HEIGHT
-    descriptor = describe(gbuffer, sigma=_times(sigma, scale), foreshortening=foreshortening, creases=creases)
+    descriptor = describe(gbuffer, sigma=as_number(sigma) * scale, foreshortening=foreshortening, creases=creases)
     return illuminate(gbuffer, descriptor, lights, material, enhancement)
 
 
@@ -122,7 +121,7 @@ def illuminate(
     """The light stage for a ready descriptor, with strengths stated for an image height of 600 px."""
     scale = gbuffer.mask.shape[0] / REFERENCE_HEIGHT
     if isinstance(enhancement, LightWarp):
-        alpha = _times(enhancement.alpha, scale)
+        alpha = as_number(enhancement.alpha) * scale
         return shade_warped(gbuffer, descriptor, lights, material, alpha=alpha, gamma=enhancement.gamma)
     if isinstance(enhancement, RadianceScaling):
         return shade_scaled(
@@ -136,11 +135,6 @@ def illuminate(
             anisotropy=enhancement.anisotropy,
         )
     return shade(gbuffer, lights, material)
-
-
-def _times(value, scale: float):
-    """A number by NumPy where it is known (`checks.as_number`)."""
-    return (np.asarray if np.ndim(value) == 0 and is_concrete(value) else jnp.asarray)(value) * scale
 
 
 def check_enhancement(enhancement) -> None:

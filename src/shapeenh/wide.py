@@ -1,4 +1,4 @@
-"""Compiled programs for wide registers. Imports nothing of ours."""
+"""Compiled programs for wide registers. Imports `checks` only."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import functools
 
 import jax
 import jax.numpy as jnp
+
+from shapeenh.checks import is_concrete
 
 OPTIONS = {"xla_cpu_prefer_vector_width": 512}
 
@@ -21,14 +23,11 @@ def jit_wide(function, **options):
 
     @functools.wraps(function)
     def call(*args, **kwargs):
-        return (wide if _is_outermost((args, kwargs)) and _is_accepted() else usual)(*args, **kwargs)
+        made_here = jnp.zeros(())  # a tracer within a trace, whatever the arguments are
+        outermost = is_concrete(args, kwargs, made_here)
+        return (wide if outermost and _is_accepted() else usual)(*args, **kwargs)
 
     return call
-
-
-def _is_outermost(arguments) -> bool:
-    made_here = jnp.zeros(())  # a tracer within a trace, whatever the arguments are
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in (*jax.tree.leaves(arguments), made_here))
 
 
 @functools.cache

@@ -141,7 +141,7 @@ def describe(gbuffer, *, sigma=0.0, foreshortening=1.0, importance=None, creases
         corner,
         number(sigma),
         None if is_concrete(foreshortening) and np.asarray(foreshortening) == 1 else number(foreshortening),
-        None if importance is None else jnp.asarray(importance, dtype),
+        None if importance is None else number(importance),
         number(degrees),
         smoothing=_smoothing(sigma, importance, scheme) if smooth else None,
         with_creases=with_creases,
