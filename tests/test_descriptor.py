@@ -232,6 +232,27 @@ def test_skipping_does_not_change_the_result(x64):
         np.testing.assert_allclose(a.gradient, b.gradient, rtol=1e-7, atol=1e-9)
 
 
+def test_only_the_fields_asked_for_are_made(x64):
+    fields, _ = reference.traced_spheres(*SIZE, [((0, 0, -5), 1.0), ((0.8, 0.3, -5.9), 1.4)])
+    g = buffer(fields)
+    whole = se.describe(g, sigma=3.0)
+    for names in (("hessian",), ("crease", "silhouette"), ()):
+        found = se.describe(g, sigma=3.0, fields=names)
+        for name in ("hessian", "gradient", "silhouette", "crease", "conductance"):
+            if name in names:
+                np.testing.assert_allclose(getattr(found, name), getattr(whole, name), atol=1e-12)
+            else:
+                assert getattr(found, name) is None
+    with pytest.raises(ValueError, match=r"descriptor\.hessian is None"):
+        se.shade_warped(
+            g,
+            se.describe(g, fields=("crease",)),
+            se.Lights(np.eye(3), np.ones((3, 3))),
+            se.named_material("stone"),
+            alpha=1.0,
+        )
+
+
 def test_only_the_part_that_holds_the_object_is_worked_on(x64, compilations):
     """In a large image with a small object: the same result as where the mask is not known, 0 around it, and the same
     code wherever the object is."""
@@ -335,6 +356,7 @@ def test_wrong_arguments_are_named():
         ({"importance": np.ones((3, 3))}, "importance"),
         ({"creases": 200.0}, "creases"),
         ({"scheme": "quick"}, "scheme"),
+        ({"fields": ("hessian", "curvature")}, "fields"),
     ):
         with pytest.raises(ValueError, match=name):
             se.describe(g, **arguments)

@@ -93,6 +93,24 @@ def test_without_a_specular_lobe_the_diffuse_one_is_left(x64, rng, way):
     np.testing.assert_allclose(shade(material.diffuse, None), expected, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize("way", ["plain", "warped", "scaled", "both"])
+def test_a_specular_reflectance_without_colour_is_an_equal_one_in_every_channel(dtype, rng, way):
+    """Its sum is another one: however it is given, the picture is that of a colour nobody knows."""
+    gbuffer, descriptor, lights, material = make_scene(rng, dtype)
+
+    def shade(specular):
+        m = se.Material(material.diffuse, specular, material.shininess)
+        if way == "plain":
+            return se.shade(gbuffer, lights, m)
+        function = se.shade_warped if way == "warped" else se.shade_scaled
+        return function(gbuffer, descriptor, lights, m, **OPTIONS[way])
+
+    for value in (0.0, 0.3, 1.0):
+        colour = jax.jit(shade)(jnp.full(3, value, dtype))
+        for given in (value, jnp.asarray(value), np.full(3, value), jnp.full((HEIGHT, WIDTH), value, dtype)):
+            assert_relative(shade(given), np.asarray(colour, np.float64), 2e-5 if dtype == np.float32 else 1e-12)
+
+
 def test_radiance_is_linear_in_the_lights(x64, rng):
     gbuffer, descriptor, lights, material = make_scene(rng, x64)
     halves = [se.Lights(lights.direction[s], lights.radiance[s]) for s in (slice(0, 13), slice(13, None))]
@@ -121,7 +139,7 @@ def image_of_everything(scene, kind):
     """(image, values): the weighed sum of the picture as a function of a dict of every input."""
     gbuffer, descriptor, lights, material = scene
     weight = jnp.asarray(np.random.default_rng(5).normal(size=(HEIGHT, WIDTH, 3)))
-    options = OPTIONS[kind.removeprefix("matte ")]
+    options = OPTIONS[kind.split()[-1]]
     shade = se.shade_warped if "invariant" not in options else se.shade_scaled
 
     def image(v):
@@ -143,10 +161,14 @@ def image_of_everything(scene, kind):
     values |= {name: getattr(material, name) for name in ("diffuse", "specular", "shininess")}
     if kind.startswith("matte"):
         del values["specular"], values["shininess"]
+    if kind.startswith("grey"):
+        values["specular"] = jnp.asarray(0.2)
+    if kind.startswith("grey map"):
+        values["specular"] = jnp.linspace(0, 1, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)
     return image, values | {name: jnp.asarray(value) for name, value in options.items()}
 
 
-@pytest.mark.parametrize("kind", ["matte warped", "matte both"])  # glossy ones: test_claims
+@pytest.mark.parametrize("kind", ["matte warped", "matte both", "grey both", "grey map warped"])  # others: test_claims
 def test_gradients_equal_central_differences(x64, rng, kind):
     image, values = image_of_everything(make_scene(rng, x64, lights=11), kind)
     gradient = jax.jit(jax.grad(image))(values)
@@ -173,8 +195,9 @@ def test_what_is_not_asked_for_changes_nothing(x64, rng):
         np.testing.assert_allclose(alone, together[name], rtol=1e-12)
 
 
+@pytest.mark.parametrize("reflectance", [0.0, (0.0, 0.0, 0.0)])
 @pytest.mark.parametrize("kind", ["warped", "both"])
-def test_gradients_are_finite_at_singular_pixels(dtype, kind):
+def test_gradients_are_finite_at_singular_pixels(dtype, kind, reflectance):
     """Umbilics, zero and huge Hessians, normals along and across the view, lights at both poles."""
     normal = np.tile([[0, 0, 1], [1, 0, 0], [0, 1, 0], [0.6, 0, -0.8]], (2, 1)).reshape(2, 4, 3)
     hessian = np.array([[[0, 0, 0], [1, 0, 1], [1e30, 0, -1e30], [-1e30, 1e30, 3]]] * 2)
@@ -184,7 +207,7 @@ def test_gradients_are_finite_at_singular_pixels(dtype, kind):
         se.GBuffer(plane > 0, plane, normal, normal),
         se.Descriptor(hessian, hessian[..., :2], plane, plane, plane),
         se.Lights(jnp.asarray([[0, 0, 1], [0, 0, -1], [1, 0, 0], [0, 1, 0]], dtype), jnp.ones((4, 3), dtype)),
-        se.Material(jnp.full(3, 0.5, dtype), jnp.full(3, 0.0, dtype), jnp.asarray(0.0, dtype)),
+        se.Material(jnp.full(3, 0.5, dtype), jnp.asarray(reflectance, dtype), jnp.asarray(0.0, dtype)),
     )
     gbuffer, descriptor, lights, material = scene
     options = {"alpha": 1e6} if kind == "warped" else {"alpha": 1e6, "invariant": 0.5, "anisotropy": 1.0}

@@ -42,7 +42,7 @@ def check_shape(name: str, array, shape: tuple) -> None:
     fits = tail is not None and (len(given) == len(wanted) or wanted is not shape)
     if not fits or any(w is not None and w != g for w, g in zip(wanted, tail or (), strict=False)):
         text = ", ".join("..." if s is Ellipsis else "any" if s is None else str(s) for s in shape)
-        raise ValueError(f"{name} has shape {given}; accepted is [{text}]")
+        raise ValueError(f"{name} {'is None' if array is None else f'has shape {given}'}; accepted is [{text}]")
 
 
 def check_finite(name: str, array) -> None:

@@ -107,7 +107,13 @@ def enhance(
     if enhancement is None:
         return shade(gbuffer, lights, material)
     scale = gbuffer.mask.shape[0] / REFERENCE_HEIGHT
-    descriptor = describe(gbuffer, sigma=as_number(sigma) * scale, foreshortening=foreshortening, creases=creases)
+    descriptor = describe(
+        gbuffer,
+        sigma=as_number(sigma) * scale,
+        foreshortening=foreshortening,
+        creases=creases,
+        fields=("hessian",),
+    )
     return illuminate(gbuffer, descriptor, lights, material, enhancement)
 
 

@@ -104,6 +104,8 @@ class Descriptor:
     silhouette: [H, W] weight in [0, 1]; 0 off the mask.
     crease: [H, W] weight in [0, 1]; 0 off the mask and where creases were not asked for.
     conductance: [H, W] in [0, 1]; 0 off the mask.
+
+    Fields that `describe` was not asked for are None.
     """
 
     hessian: jax.Array

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -95,7 +96,19 @@ def principal_directions(hessian):
 # ------------------------------------------------------------------------------------------- the descriptor
 
 
-def describe(gbuffer, *, sigma=0.0, foreshortening=1.0, importance=None, creases=False, scheme="fast") -> Descriptor:
+FIELDS = ("hessian", "gradient", "silhouette", "crease", "conductance")
+
+
+def describe(
+    gbuffer,
+    *,
+    sigma=0.0,
+    foreshortening=1.0,
+    importance=None,
+    creases=False,
+    scheme="fast",
+    fields=FIELDS,
+) -> Descriptor:
     """The local shape descriptor: silhouettes, creases, and curvature at a scale of `sigma` pixels (LW09 algorithm 1).
 
     gbuffer: GBuffer. Pixels with a NaN or infinite normal count as off the mask.
@@ -106,9 +119,10 @@ def describe(gbuffer, *, sigma=0.0, foreshortening=1.0, importance=None, creases
         counts alone decide.
     creases: False (none computed), True (edges sharper than 40 degrees between pixels), or a threshold in degrees.
     scheme: "explicit" (steps of 1/5) or "fast" (the same sigma on a pyramid, to about 1 %; `importance` needs steps).
-    *Static*: scheme; whether `importance` is given and `creases` asked for. A concrete `sigma` = 0 skips the
+    fields: names of the fields that are made, the others are None: light needs ("hessian",) alone.
+    *Static*: scheme, fields; whether `importance` is given and `creases` asked for. A concrete `sigma` = 0 skips the
         diffusion, a concrete mask what lies around it (in images of 2^17 pixels or more).
-    Returns a Descriptor; all its fields are 0 off the mask.
+    Returns a Descriptor; its fields are 0 off the mask.
     *Gradient*: in reverse mode, with respect to normals, depth (through the silhouettes' flanks), sigma, foreshortening
         and importance.
     *Errors*: ValueError for fields whose shapes disagree, and for numbers out of range.
@@ -126,6 +140,8 @@ def describe(gbuffer, *, sigma=0.0, foreshortening=1.0, importance=None, creases
         check_shape("importance", importance, shape)
         check_range("importance", importance, 0, 5 * diffusion.GREATEST_SIGMA**2 / 2)
     check_choice("scheme", scheme, ("fast", "explicit"))
+    for name in fields:
+        check_choice("fields", name, FIELDS)
     with_creases = creases is not False
     degrees = CREASE_DEGREES if creases is True else creases
     if with_creases:
@@ -145,6 +161,7 @@ def describe(gbuffer, *, sigma=0.0, foreshortening=1.0, importance=None, creases
         number(degrees),
         smoothing=_smoothing(sigma, importance, scheme) if smooth else None,
         with_creases=with_creases,
+        fields=tuple(name for name in FIELDS if name in fields),
         size=size,
     )
 
@@ -178,7 +195,7 @@ def check_gbuffer(gbuffer) -> None:
         check_shape("gbuffer.occlusion", gbuffer.occlusion, (h, w))
 
 
-@partial(jax.jit, static_argnames=("smoothing", "with_creases", "size"))
+@partial(jax.jit, static_argnames=("smoothing", "with_creases", "fields", "size"))
 def _describe(gbuffer, corner, sigma, foreshortening, importance, degrees, *, size, **static):
     if size is None:
         return _describe_all(gbuffer, sigma, foreshortening, importance, degrees, **static)
@@ -188,7 +205,7 @@ def _describe(gbuffer, corner, sigma, foreshortening, importance, degrees, *, si
     return paste(part, corner, shape)
 
 
-def _describe_all(gbuffer, sigma, foreshortening, importance, degrees, *, smoothing, with_creases):
+def _describe_all(gbuffer, sigma, foreshortening, importance, degrees, *, smoothing, with_creases, fields):
     varies = gbuffer.normal, gbuffer.position, sigma, foreshortening, importance, degrees
     always = unknown_truth(*jax.tree.leaves(varies))
 
@@ -214,13 +231,9 @@ def _describe_all(gbuffer, sigma, foreshortening, importance, degrees, *, smooth
 
     # 7: the Hessian, flat at the singular places
     hessian = _hessian(g, places, link_x, link_y, c, foreshortening, bend, always)
-    return Descriptor(
-        hessian=jnp.stack(hessian, axis=-1),
-        gradient=jnp.moveaxis(g, 0, -1),
-        silhouette=w_s,
-        crease=w_c,
-        conductance=c,
-    )
+    made = (jnp.stack(hessian, axis=-1), jnp.moveaxis(g, 0, -1), w_s, w_c, c)
+    found: dict[str, Any] = {name: value if name in fields else None for name, value in zip(FIELDS, made, strict=True)}
+    return Descriptor(**found)
 
 
 def _budget(sigma, importance):

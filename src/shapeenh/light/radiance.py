@@ -71,6 +71,9 @@ def _prologue(model: Model, inputs, on):
     specular, shininess = inputs["specular"], inputs["shininess"]
     planes["shininess"] = shininess[:, 0]
     peak = (shininess + 1) / (8 * np.pi) * factor[:, None]
+    if not model.tinted:
+        planes["reflectance"] = specular[:, 0]
+        return planes, (diffuse * (1 - specular), peak)
     return planes, (diffuse * (1 - specular), specular * peak, (1 - specular) * peak)
 
 
@@ -90,6 +93,8 @@ def _reach(model: Model) -> tuple[tuple[str, tuple[str, ...]], ...]:
     table = {"normal": ("nx", "ny", "nz", *tensor[:2])}
     if model.glossy:
         table["shininess"] = ("shininess",)
+        if not model.tinted:
+            table["specular"] = ("reflectance",)
     if model.warped:
         table |= {"alpha": (*tensor, *bend)}
     if model.scaled and model.anisotropic:
@@ -134,7 +139,9 @@ def _shade(model: Model, gbuffer, lights, material, options: dict):
         model = model._replace(glossy=False)
         options = {name: value for name, value in options.items() if name != "gamma_specular"}
     else:
-        inputs["specular"] = _input("material.specular", material.specular, size, 3, dtype)
+        specular, tinted = _grey_if_known(material.specular)
+        model = model._replace(tinted=tinted)
+        inputs["specular"] = _input("material.specular", specular, size, 3 if tinted else 1, dtype)
         inputs["shininess"] = _input("material.shininess", material.shininess, size, 1, dtype)
     for name, value in options.items():
         inputs[name] = jnp.asarray(value, dtype) if name == "hessian" else _input(name, value, size, 1, dtype)
@@ -142,6 +149,15 @@ def _shade(model: Model, gbuffer, lights, material, options: dict):
     direction, radiance, count = _prepared_lights(lights, dtype)
     plan = sums.Plan(model, _prologue, _epilogue, _reach(model), *_steps())
     return _shade_image(plan, jnp.asarray(gbuffer.mask, bool), inputs, direction, radiance, count)
+
+
+def _grey_if_known(specular):
+    """(The specular reflectance, whether it has a colour): without one, a sum over lights less is needed."""
+    if np.ndim(specular) in (0, 2):
+        return specular, False
+    if np.shape(specular) == (3,) and checks.is_concrete(specular) and len(set(np.asarray(specular).tolist())) == 1:
+        return np.asarray(specular)[0], False
+    return specular, True
 
 
 def _input(name, value, size, channels, dtype):

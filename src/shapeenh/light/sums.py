@@ -121,7 +121,8 @@ def _forms(model: kernel.Model, planes, light):
 
 
 def _weights(model: kernel.Model, on, planes, rows):
-    """(What the weights and their derivatives have in common, the weights), each (block, light, 64) and stored.
+    """(What the weights and their derivatives have in common, the weights), each (block, light, 64) and stored: A and B
+    belong to both.
 
     What they have in common apart: a root, a cosine and a logarithm once instead of in every kernel that needs them,
     and kernels that keep fewer values alive, take a fifth less time.
@@ -145,7 +146,12 @@ def _weights(model: kernel.Model, on, planes, rows):
         known = known | {"curvature": made(functools.partial(kernel.curvature, model), known)}
         for lobe in kernel.lobes(model):
             known = known | {f"gain_{lobe}": made(functools.partial(kernel.anisotropic_gain, lobe), known)}
-    return known, made(functools.partial(kernel.weights, model), known)
+    known = known | {"diffuse": made(functools.partial(kernel.diffuse, model), known)}
+    if not model.glossy:
+        return known, (known["diffuse"],)
+    known = known | {"specular": made(functools.partial(kernel.specular, model), known)}
+    last = made(functools.partial(kernel.reflected, model), known)
+    return known, (known["diffuse"], known["specular"], last) if model.tinted else (known["diffuse"], last)
 
 
 def _add_weighted(total, weight, colour):
@@ -300,11 +306,11 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
             sums, planes_bar, light_bar = carry
             known, weight = _weights(plan.model, on, planes, rows)
 
-            def derivatives(planes, rows, known, weight):
+            def derivatives(planes, rows, known):
                 light, colour = _unpack(rows)
                 form = _forms(plan.model, planes, light) | known
                 along = tuple(sum(bar[:, None, c] * colour[:, :, c, None] for c in range(3)) for bar in sums_bar)
-                bar, w_bar = kernel.adjoint(plan.model, form, light, weight, along)
+                bar, w_bar = kernel.adjoint(plan.model, form, light, along)
                 return {name: bar[name] for name in used}, w_bar
 
             def added(planes_bar, forms_bar, rows):
@@ -321,7 +327,7 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
                 return tuple(_add_weighted(*pair, colour) for pair in zip(sums, weight, strict=True))
 
             if used:
-                forms_bar, w_bar = stored(on, derivatives, planes, rows, known, weight)
+                forms_bar, w_bar = stored(on, derivatives, planes, rows, known)
                 planes_bar = stored(then, added, planes_bar, {form: forms_bar[form] for form in reached}, rows)
             if images or constants:
                 sums = stored(then, summed, sums, weight, rows)

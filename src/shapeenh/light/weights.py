@@ -6,8 +6,9 @@ Radiance is linear in the light's colour, so the sum over lights needs a few sca
     B = (n.h)^eta / ((e.h) max(n.l, n.e)) <n.l> j       specular
     C = B (1 - e.h)^5                                   Fresnel's part of it
 
-with e = z, h the half vector and j the solid angle of the warp without its factor det(L^-1). What depends on the pixel
-alone (reflectances, constants, det, contrast) stays outside the sum.
+or, where the specular reflectance R_s has no colour, A and S = R_s B + (1 - R_s) C alone. Here e = z, h is the half
+vector and j the solid angle of the warp without its factor det(L^-1). What depends on the pixel alone (reflectances,
+constants, det, contrast) stays outside the sum.
 
 A pixel and a light meet in a few *forms*, sums of products of a plane of the pixel and a coefficient of the light
 (`terms`); the weights are functions of the forms. So the adjoint of the sum needs one scalar per form, pixel and light.
@@ -32,10 +33,11 @@ class Model(NamedTuple):
     scaled: bool = False
     anisotropic: bool = False
     glossy: bool = True  # without it there is no specular lobe: A alone, and nothing of B and C is computed
+    tinted: bool = True  # whether the specular reflectance has a colour; without it S in place of B and C
 
     @property
     def components(self) -> int:
-        return 3 if self.glossy else 1
+        return 1 + self.glossy + (self.glossy and self.tinted)
 
 
 COEFFICIENTS = ("one", "x", "y", "z", "xx", "xy", "yy", "w", "v")
@@ -58,6 +60,8 @@ def terms(model: Model) -> dict[str, tuple[tuple[str, str], ...]]:
     table: dict[str, tuple[tuple[str, str], ...]] = {"cos_view": (("nz", "one"),)}
     if model.glossy:
         table["shininess"] = (("shininess", "one"),)
+        if not model.tinted:
+            table["reflectance"] = (("reflectance", "one"),)
     if model.warped:
         # With T = L^-1 and p' of the light: T p' . n_xy = (T n_xy) . p' and |T p'|^2 = p' . T^2 p'.
         table["tilt"] = (("ux", "x"), ("uy", "y"))
@@ -151,6 +155,17 @@ def _fifth(x):
     return _fourth(x) * x
 
 
+def reciprocal_root(x):
+    """x^-1/2 of normal x > 0. In float32 by Newton's method from a guess of its bits, to 1 ulp: root and quotient take
+    longer, and the processors' own guess differs from one width of registers to the next."""
+    if x.dtype != np.float32:
+        return jnp.sqrt(1 / x)
+    y = lax.bitcast_convert_type(0x5F375A86 - (lax.bitcast_convert_type(x, jnp.int32) >> 1), jnp.float32)
+    for _ in range(3):
+        y = y + y * (0.5 - 0.5 * x * y * y)
+    return y
+
+
 def gain(exponent):
     """exp(gamma kappa), held where products of it and of its inverse stay finite: sigma is at its limit there."""
     bound = 0.3 * np.log(np.finfo(exponent.dtype).max)
@@ -175,9 +190,8 @@ class Meeting(NamedTuple):
 
 
 def root(form: dict, light: dict):
-    """t = (w^2 + |T p'|^2)^-1/2, of warped models: part of the forms for what follows. By operations that are rounded
-    correctly: `rsqrt` is approximated, in another way for every width of registers."""
-    return jnp.sqrt(1 / (light["w"] * light["w"] + form["stretch"]))
+    """t = (w^2 + |T p'|^2)^-1/2, of warped models: part of the forms for what follows."""
+    return reciprocal_root(light["w"] * light["w"] + form["stretch"])
 
 
 def warped_cosine(form: dict, light: dict):
@@ -207,24 +221,32 @@ def meet(model: Model, form: dict, light: dict) -> Meeting:
     return Meeting(cos_light, half_view, inverse, cos_half, j, square)
 
 
-def weights(model: Model, form: dict, light: dict):
-    """(A, B, C) of the module's docstring, or (A,); the forms contain log(n.h) of glossy models, of anisotropic
-    ones the curvature and the gains."""
+def diffuse(model: Model, form: dict, light: dict):
+    """A of the module's docstring; of anisotropic models the forms contain the curvature and the gains."""
     at = meet(model, form, light)
-    lit = at.cos_light * at.j
-    diffuse = (1 - _fifth(1 - 0.5 * at.cos_light)) * lit
-    if model.scaled:
-        diffuse = diffuse * scaling(form["gain_diffuse"], jnp.minimum(at.cos_light, 1), form["invariant"])
-    if not model.glossy:
-        return (diffuse,)
+    lobe = (1 - _fifth(1 - 0.5 * at.cos_light)) * (at.cos_light * at.j)
+    if not model.scaled:
+        return lobe
+    return lobe * scaling(form["gain_diffuse"], jnp.minimum(at.cos_light, 1), form["invariant"])
+
+
+def specular(model: Model, form: dict, light: dict):
+    """B of the module's docstring; the forms contain log(n.h), and the gains as in `diffuse`."""
+    at = meet(model, form, light)
     log = form["log"]
     tiny = np.finfo(log.dtype).tiny ** 0.25
     # The larger cosine is at least n.e; at n.e = 0 an unlit pixel would divide 0 by 0.
     top = jnp.maximum(jnp.maximum(at.cos_light, form["cos_view"]), tiny)
-    specular = exponential(jnp.minimum(form["shininess"] * log, 0)) * lit * at.inverse / top
-    if model.scaled:
-        specular = specular * scaling(form["gain_specular"], jnp.minimum(at.cos_half, 1), form["invariant"])
-    return diffuse, specular, specular * _fifth(1 - at.half_view)
+    lobe = exponential(jnp.minimum(form["shininess"] * log, 0)) * (at.cos_light * at.j) * at.inverse / top
+    if not model.scaled:
+        return lobe
+    return lobe * scaling(form["gain_specular"], jnp.minimum(at.cos_half, 1), form["invariant"])
+
+
+def reflected(model: Model, form: dict, light: dict):
+    """C, or S, of the module's docstring; the forms contain B as "specular"."""
+    fifth = _fifth(1 - meet(model, form, light).half_view)
+    return form["specular"] * (fifth if model.tinted else form["reflectance"] * (1 - fifth) + fifth)
 
 
 def curvature(model: Model, form: dict, light: dict):
@@ -260,8 +282,8 @@ def _scaling_slopes(gain, delta, invariant):
     )
 
 
-def adjoint(model: Model, form: dict, light: dict, given, along):
-    """Cotangents of the forms and of w, from those of the weights, `along`; `given` are the weights.
+def adjoint(model: Model, form: dict, light: dict, along):
+    """Cotangents of the forms and of w, from those of the weights, `along`; the forms contain A and B.
 
     By logarithmic derivatives: B is there already, and with P = (B' + C' (1 - e.h)^5) B, primes marking cotangents,
 
@@ -278,7 +300,7 @@ def adjoint(model: Model, form: dict, light: dict, given, along):
 
     # The diffuse lobe: the slope of A over n.l at fixed j and sigma.
     along_diffuse = along[0]
-    whole = along_diffuse * given[0]
+    whole = along_diffuse * form["diffuse"]
     x = 1 - 0.5 * cos_light
     fourth = _fourth(x)
     slope = (1 - fourth * x + 2.5 * cos_light * fourth) * at.j
@@ -294,9 +316,13 @@ def adjoint(model: Model, form: dict, light: dict, given, along):
     # The specular lobe.
     if model.glossy:
         tiny = np.finfo(cos_view.dtype).tiny ** 0.25
-        along_specular, along_fresnel = along[1], along[2]
         rest = 1 - at.half_view
-        peak = (along_specular + along_fresnel * _fifth(rest)) * given[1]
+        if model.tinted:
+            along_specular, along_fresnel = along[1], along[2]
+        else:
+            along_specular, along_fresnel = along[1] * form["reflectance"], along[1] * (1 - form["reflectance"])
+            bar["reflectance"] = along[1] * form["specular"] * (1 - _fifth(rest))
+        peak = (along_specular + along_fresnel * _fifth(rest)) * form["specular"]
         bar["shininess"] = peak * form["log"]
         half_slope = form["shininess"]  # d log B / d log n.h
         if model.scaled:
@@ -312,7 +338,7 @@ def adjoint(model: Model, form: dict, light: dict, given, along):
         grazing = cos_light < cos_view
         light_bar = light_bar + by_half + jnp.where(grazing, quotient * both, 0)
         view_bar = by_half - jnp.where(grazing, peak / jnp.maximum(cos_view, tiny), 0)
-        log_half_view = -(half_slope + 1) * peak - 5 * along_fresnel * given[1] * _fourth(rest) * at.half_view
+        log_half_view = -(half_slope + 1) * peak - 5 * along_fresnel * form["specular"] * _fourth(rest) * at.half_view
         log_j = log_j + peak
 
     # The gains E, whose curvature may see the light.
