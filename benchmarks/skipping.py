@@ -52,18 +52,24 @@ def pairs() -> dict[str, tuple]:
     sheen = shade(material=se.Material(jnp.zeros(3), jnp.zeros(3), stone.shininess))  # Schlick's, at R_s = 0
     some = lights.radiance.at[::2].set(0)
     general_warp, general_scale, general_bend = map(jit_wide, (warp, scale, lambda a: scale(anisotropy=a)))
+    general_tint = jit_wide(lambda specular: shade(material=se.Material(stone.diffuse, specular, stone.shininess)))
     general_describe = jax.jit(lambda g, sigma: se.describe(g, sigma=sigma).hessian)
     plain_describe = jax.jit(lambda g: se.describe(g, sigma=0.0).hessian)
     return {
         "no warp (alpha = 0)": (lambda: general_warp(0.0), lambda: warp(0.0)),
         "no scaling (gamma = 0)": (lambda: general_scale(0.0), lambda: scale(0.0)),
         "no anisotropy": (lambda: general_bend(0.0), scale),
+        "no colour in R_s": (lambda: general_tint(stone.specular), shade),
         "no specular lobe": (lambda: shade(material=dull), lambda: shade(material=se.Material(stone.diffuse)) + sheen),
         "every other light dark": (lambda: shade(radiance=jnp.maximum(some, 1e-30)), lambda: shade(radiance=some)),
         "lights behind the object": (shade, lambda: shade(radiance=jnp.where(behind, lights.radiance, 0))),
         "background": (lambda: shade(gbuffer=full), shade),
         "no diffusion (sigma = 0)": (lambda: general_describe(g, 0.0), lambda: plain_describe(g)),
         "no creases": (lambda: describe(creases=True), describe),
+        "fields but the Hessian": (
+            lambda: jax.block_until_ready(se.describe(g, sigma=2.0)).hessian,
+            lambda: se.describe(g, sigma=2.0, fields=("hessian",)).hessian,
+        ),
         "no enhancement, so no descriptor": (lambda: render(se.LightWarp(1e-30)), lambda: render(None)),
     }
 

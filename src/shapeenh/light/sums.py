@@ -120,9 +120,9 @@ def _forms(model: kernel.Model, planes, light):
     return form
 
 
-def _weights(model: kernel.Model, on, planes, rows):
-    """(What the weights and their derivatives have in common, the weights), each (block, light, 64) and stored: A and B
-    belong to both.
+def _weights(model: kernel.Model, on, planes, rows, derivatives: bool):
+    """(What the weights and their derivatives have in common, the weights), each (block, light, 64) and stored; with
+    `derivatives` all that these need of it.
 
     What they have in common apart: a root, a cosine and a logarithm once instead of in every kernel that needs them,
     and kernels that keep fewer values alive, take a fifth less time.
@@ -149,6 +149,8 @@ def _weights(model: kernel.Model, on, planes, rows):
     known = known | {"diffuse": made(functools.partial(kernel.diffuse, model), known)}
     if not model.glossy:
         return known, (known["diffuse"],)
+    if not model.tinted and not derivatives:
+        return known, (known["diffuse"], made(functools.partial(kernel.reflected_at_once, model), known))
     known = known | {"specular": made(functools.partial(kernel.specular, model), known)}
     last = made(functools.partial(kernel.reflected, model), known)
     return known, (known["diffuse"], known["specular"], last) if model.tinted else (known["diffuse"], last)
@@ -239,7 +241,7 @@ def _forward(plan: Plan, mask, inputs, direction, radiance, count):
 
         def body(sums, numbers, rows):
             _, colour = _unpack(rows)
-            _, weight = _weights(plan.model, on, planes, rows)
+            _, weight = _weights(plan.model, on, planes, rows, derivatives=False)
             return tuple(_add_weighted(*pair, colour) for pair in zip(sums, weight, strict=True))
 
         zero = jnp.zeros((group, 3, blocks.PIXELS), planes.dtype)
@@ -304,7 +306,7 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
 
         def body(carry, numbers, rows):
             sums, planes_bar, light_bar = carry
-            known, weight = _weights(plan.model, on, planes, rows)
+            known, weight = _weights(plan.model, on, planes, rows, derivatives=True)
 
             def derivatives(planes, rows, known):
                 light, colour = _unpack(rows)

@@ -249,6 +249,11 @@ def reflected(model: Model, form: dict, light: dict):
     return form["specular"] * (fifth if model.tinted else form["reflectance"] * (1 - fifth) + fifth)
 
 
+def reflected_at_once(model: Model, form: dict, light: dict):
+    """`reflected` where B itself is not needed."""
+    return reflected(model, form | {"specular": specular(model, form, light)}, light)
+
+
 def curvature(model: Model, form: dict, light: dict):
     """tanh of the curvature that the direction of the light sees, of anisotropic models."""
     return jnp.tanh(form["mean"] + form["bend"] * meet(model, form, light).j)
