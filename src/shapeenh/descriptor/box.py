@@ -12,7 +12,7 @@ from jax import lax
 
 _LEAST_PIXELS = 1 << 17  # smaller images are not worth another compilation
 _WORTH = 0.8  # nor are parts larger than this
-_EIGHTHS = (2, 3, 4, 5, 6, 8)
+_SIXTEENTHS = (4, 6, 8, 10, 11, 12, 14, 16)
 _GRID = 4  # positions and sizes left out are multiples: the blocks of the fast diffusion stay where they are
 
 
@@ -33,8 +33,8 @@ def _span(used) -> tuple[int, int] | None:
     places = np.flatnonzero(used)
     if not places.size:
         return None
-    for eighths in _EIGHTHS:
-        outside = len(used) * (8 - eighths) // 8 // _GRID * _GRID
+    for part in _SIXTEENTHS:
+        outside = len(used) * (16 - part) // 16 // _GRID * _GRID
         length = len(used) - outside
         first = min(places[0] // _GRID * _GRID, outside)
         if first + length > places[-1]:
