@@ -23,10 +23,10 @@ def padded(image):
     return jnp.pad(image, [(0, rows), (0, columns)] + [(0, 0)] * (image.ndim - 2))
 
 
-def tiled(image):
-    """[H, W, ...] as [rows of blocks, 8, columns of blocks, 8, ...], without moving data."""
-    height, width = image.shape[:2]
-    return image.reshape(height // SIDE, SIDE, width // SIDE, SIDE, *image.shape[2:])
+def covered(mask):
+    """Which blocks have a pixel on the padded mask [H, W]; in two steps, so that the first one vectorises."""
+    rows = jnp.any(mask.reshape(-1, SIDE, mask.shape[1]), axis=1)
+    return jnp.any(rows.reshape(-1, SIDE), axis=1)
 
 
 def listed(key, covered, group: int):

@@ -179,22 +179,23 @@ def _group(plan: Plan, mask) -> int:
 
 
 def _plan_walk(plan: Plan, mask, normal, table, count) -> _Walk:
-    covered = jnp.any(blocks.tiled(mask), axis=(1, 3)).reshape(-1)
+    covered = blocks.covered(mask)
     group = _group(plan, mask)
     ids, total = blocks.listed(jnp.zeros(covered.shape, jnp.int32), covered, group)
+    size = min(4 * group, ids.shape[0])
 
     def box(i, found):
-        part = lax.dynamic_slice_in_dim(ids, i * group, group)
+        part = lax.dynamic_slice_in_dim(ids, i * size, size)
         n, valid = blocks.read(normal, part), blocks.read(mask, part)
         n = jnp.concatenate([n[:, :2], jnp.abs(n[:, 2:])], axis=1)  # as the prologue shades it
         valid = valid & (jnp.abs(n) <= 2)
         ends = blocks.least(jnp.where(valid, n, 2)), -blocks.least(jnp.where(valid, -n, 2))
         return tuple(
-            lax.dynamic_update_slice_in_dim(a, new.T, i * group, axis=1) for a, new in zip(found, ends, strict=True)
+            lax.dynamic_update_slice_in_dim(a, new.T, i * size, axis=1) for a, new in zip(found, ends, strict=True)
         )
 
     empty = jnp.zeros((3, ids.shape[0]), normal.dtype)
-    low, high = lax.fori_loop(0, -(-total // group), box, (empty, empty))
+    low, high = lax.fori_loop(0, -(-total // size), box, (empty, empty))
 
     def count_lights(i, work):
         return work + sum(_seen((low, high), table, i * plan.chunk, plan.chunk, count).astype(jnp.int32))
@@ -204,18 +205,18 @@ def _plan_walk(plan: Plan, mask, normal, table, count) -> _Walk:
     return _Walk(ids[order], total, low[:, order], high[:, order])
 
 
-def _read_inputs(inputs, mask, ids):
-    """Planes of every input at the pixels of some blocks, and where they are valid; elsewhere 0, and n = z."""
-    found = {
-        name: blocks.read(value, ids)
-        if value.ndim >= 2
-        else jnp.broadcast_to(value[None, :, None], (len(ids), len(value), blocks.PIXELS))
-        for name, value in inputs.items()
-    }
+def _read_inputs(inputs, mask, ids, spread: bool):
+    """Planes of every input at the pixels of some blocks, and where they are valid; elsewhere 0, and n = z.
+
+    Constants are (1, channel, 1), or with `spread` planes as well.
+    """
+    found = {name: blocks.read(v, ids) if v.ndim >= 2 else v[None, :, None] for name, v in inputs.items()}
     valid = blocks.read(mask, ids)
     for value in found.values():
         valid = valid & jnp.all(jnp.isfinite(value), axis=1, keepdims=True)
-    found = {name: jnp.where(valid, value, 0) for name, value in found.items()}
+    for name, value in found.items():
+        there = valid if spread or inputs[name].ndim >= 2 else jnp.isfinite(value)
+        found[name] = jnp.where(there, value, 0)
     z = jnp.where(valid, found["normal"][:, 2:], 1)
     found["normal"] = jnp.concatenate([found["normal"][:, :2], z], axis=1)
     return found, valid
@@ -223,7 +224,8 @@ def _read_inputs(inputs, mask, ids):
 
 def _plane_array(plan: Plan, on, inputs):
     planes, rest = plan.prologue(plan.model, inputs, on)
-    return jnp.stack([planes[name] for name in kernel.planes_of(plan.model)], axis=1), rest
+    whole = planes["nx"].shape
+    return jnp.stack([jnp.broadcast_to(planes[name], whole) for name in kernel.planes_of(plan.model)], axis=1), rest
 
 
 def _forward(plan: Plan, mask, inputs, direction, radiance, count):
@@ -236,7 +238,7 @@ def _forward(plan: Plan, mask, inputs, direction, radiance, count):
 
     def step(i, image):
         ids = lax.dynamic_slice_in_dim(walk.ids, i * group, group)
-        found, valid = stored(on, lambda ids: _read_inputs(inputs, mask, ids), ids)
+        found, valid = stored(on, lambda ids: _read_inputs(inputs, mask, ids, spread=False), ids)
         planes, rest = stored(on, lambda found: _plane_array(plan, on, found), found)
 
         def body(sums, numbers, rows):
@@ -293,7 +295,7 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
     def step(i, found):
         images, constants, light_bar = found
         ids = lax.dynamic_slice_in_dim(walk.ids, i * group, group)
-        pixels, valid = stored(on, lambda ids: _read_inputs(inputs, mask, ids), ids)
+        pixels, valid = stored(on, lambda ids: _read_inputs(inputs, mask, ids, spread=True), ids)
         # The list's padding repeats a block, whose cotangent counts once.
         fresh = i * group + lane < walk.total
         given = jnp.where(valid & fresh[:, None, None], blocks.read(cotangent, ids), 0)
