@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import shapeenh as se
+from shapeenh.descriptor.box import covering_part
 from shapeenh.types import replace
 from tests.reference import descriptor as reference
 
@@ -267,6 +268,23 @@ def test_only_the_part_that_holds_the_object_is_worked_on(x64, compilations):
     compilations.clear()
     se.describe(jax.tree.map(lambda a: jnp.roll(a, (40, 60), (0, 1)), g), sigma=jnp.asarray(3.0))
     assert not [name for name in compilations if "describe" in name]
+
+
+def test_the_part_holds_the_object_wherever_it_is(rng):
+    for shape in ((403, 397), (360, 368), (2, 70000)):
+        for _ in range(40):
+            (top, bottom), (left, right) = (np.sort(rng.integers(0, n, 2)) for n in shape)
+            mask = np.zeros(shape, bool)
+            mask[[top, bottom], [left, right]] = True
+            part = covering_part(mask)
+            if part is None:
+                continue
+            (row, column), (height, width) = part
+            assert 0 <= row <= top
+            assert 0 <= column <= left
+            assert bottom < row + height <= shape[0]
+            assert right < column + width <= shape[1]
+            assert row % 4 == column % 4 == 0
 
 
 def test_importance_counts_steps(x64):
