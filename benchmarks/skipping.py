@@ -33,12 +33,21 @@ def pairs() -> dict[str, tuple]:
     def shade(gbuffer=g, material=stone, radiance=lights.radiance):
         return se.shade(gbuffer, se.Lights(lights.direction, radiance), material)
 
-    def warp(alpha):
-        return se.shade_warped(g, d, lights, stone, alpha=alpha)
+    def tint(specular, scene=(g, d, lights, stone)):
+        g, _, lights, stone = scene
+        return se.shade(g, lights, se.Material(stone.diffuse, specular, stone.shininess))
 
-    def scale(gamma=2.0, anisotropy=0.0):
+    def warp(alpha, scene=(g, d, lights, stone)):
+        return se.shade_warped(*scene, alpha=alpha)
+
+    def scale(gamma=2.0, anisotropy=0.0, scene=(g, d, lights, stone)):
         strengths = {"gamma_diffuse": gamma, "gamma_specular": gamma, "anisotropy": anisotropy}
-        return se.shade_scaled(g, d, lights, stone, invariant=0.4, **strengths)
+        return se.shade_scaled(*scene, invariant=0.4, **strengths)
+
+    def traced(function):
+        """Whose scene is an argument, too: what is closed over would be a constant, and folded."""
+        compiled = jit_wide(function)
+        return lambda **strengths: compiled(scene=(g, d, lights, stone), **strengths)
 
     def describe(sigma=2.0, creases=False):
         return se.describe(g, sigma=sigma, creases=creases).hessian
@@ -51,15 +60,14 @@ def pairs() -> dict[str, tuple]:
     dull = se.Material(stone.diffuse, jnp.zeros(3), stone.shininess)
     sheen = shade(material=se.Material(jnp.zeros(3), jnp.zeros(3), stone.shininess))  # Schlick's, at R_s = 0
     some = lights.radiance.at[::2].set(0)
-    general_warp, general_scale, general_bend = map(jit_wide, (warp, scale, lambda a: scale(anisotropy=a)))
-    general_tint = jit_wide(lambda specular: shade(material=se.Material(stone.diffuse, specular, stone.shininess)))
+    general_tint, general_warp, general_scale = map(traced, (tint, warp, scale))
     general_describe = jax.jit(lambda g, sigma: se.describe(g, sigma=sigma).hessian)
     plain_describe = jax.jit(lambda g: se.describe(g, sigma=0.0).hessian)
     return {
-        "no warp (alpha = 0)": (lambda: general_warp(0.0), lambda: warp(0.0)),
-        "no scaling (gamma = 0)": (lambda: general_scale(0.0), lambda: scale(0.0)),
-        "no anisotropy": (lambda: general_bend(0.0), scale),
-        "no colour in R_s": (lambda: general_tint(stone.specular), shade),
+        "no warp (alpha = 0)": (lambda: general_warp(alpha=0.0), lambda: warp(0.0)),
+        "no scaling (gamma = 0)": (lambda: general_scale(gamma=0.0), lambda: scale(0.0)),
+        "no anisotropy": (lambda: general_scale(anisotropy=0.0), scale),
+        "no colour in R_s": (lambda: general_tint(specular=stone.specular), shade),
         "no specular lobe": (lambda: shade(material=dull), lambda: shade(material=se.Material(stone.diffuse)) + sheen),
         "every other light dark": (lambda: shade(radiance=jnp.maximum(some, 1e-30)), lambda: shade(radiance=some)),
         "lights behind the object": (shade, lambda: shade(radiance=jnp.where(behind, lights.radiance, 0))),

@@ -316,6 +316,10 @@ def test_batches_by_vmap(x64, rng):
         ({"alpha": np.ones((3, 2))}, r"alpha has shape \(3, 2\)"),
         ({"material": se.Material(2.0, 0.1, 10.0)}, r"material.diffuse is 2"),
         ({"material": se.Material(0.5, 0.1, -1.0)}, "material.shininess is -1"),
+        (
+            {"material": se.Material(0.5, np.full((2, 5), 0.1), 1.0)},
+            r"material.specular has shape \(2, 5\); accepted is \[\], \[3\] or a map of 21 x 27 pixels",
+        ),
         ({"lights": se.Lights(np.zeros((4, 3)), np.zeros((3, 3)))}, r"lights.radiance has shape \(3, 3\)"),
         ({"gbuffer": None}, "gbuffer is a NoneType; accepted is a GBuffer"),
     ],

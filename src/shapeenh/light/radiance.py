@@ -139,7 +139,7 @@ def _shade(model: Model, gbuffer, lights, material, options: dict):
         model = model._replace(glossy=False)
         options = {name: value for name, value in options.items() if name != "gamma_specular"}
     else:
-        specular, tinted = _grey_if_known(material.specular)
+        specular, tinted = _grey_if_known(material.specular, size)
         model = model._replace(tinted=tinted)
         inputs["specular"] = _input("material.specular", specular, size, 3 if tinted else 1, dtype)
         inputs["shininess"] = _input("material.shininess", material.shininess, size, 1, dtype)
@@ -151,9 +151,9 @@ def _shade(model: Model, gbuffer, lights, material, options: dict):
     return _shade_image(plan, jnp.asarray(gbuffer.mask, bool), inputs, direction, radiance, count)
 
 
-def _grey_if_known(specular):
+def _grey_if_known(specular, size):
     """(The specular reflectance, whether it has a colour): without one, a sum over lights less is needed."""
-    if np.ndim(specular) in (0, 2):
+    if np.shape(specular) in ((), size):
         return specular, False
     if np.shape(specular) == (3,) and checks.is_concrete(specular) and len(set(np.asarray(specular).tolist())) == 1:
         return np.asarray(specular)[0], False
