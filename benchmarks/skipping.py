@@ -57,8 +57,6 @@ def pairs() -> dict[str, tuple]:
 
     normal = jnp.where(g.mask[..., None], g.normal, jnp.asarray([0.0, 0.0, 1.0]))
     full = se.GBuffer(jnp.ones_like(g.mask), g.depth, normal, g.position)
-    dull = se.Material(stone.diffuse, jnp.zeros(3), stone.shininess)
-    sheen = shade(material=se.Material(jnp.zeros(3), jnp.zeros(3), stone.shininess))  # Schlick's, at R_s = 0
     some = lights.radiance.at[::2].set(0)
     general_tint, general_warp, general_scale = map(traced, (tint, warp, scale))
     general_describe = jax.jit(lambda g, sigma: se.describe(g, sigma=sigma).hessian)
@@ -68,7 +66,7 @@ def pairs() -> dict[str, tuple]:
         "no scaling (gamma = 0)": (lambda: general_scale(gamma=0.0), lambda: scale(0.0)),
         "no anisotropy": (lambda: general_scale(anisotropy=0.0), scale),
         "no colour in R_s": (lambda: general_tint(specular=stone.specular), shade),
-        "no specular lobe": (lambda: shade(material=dull), lambda: shade(material=se.Material(stone.diffuse)) + sheen),
+        "no specular lobe": (shade, lambda: shade(material=se.Material(stone.diffuse))),
         "every other light dark": (lambda: shade(radiance=jnp.maximum(some, 1e-30)), lambda: shade(radiance=some)),
         "lights behind the object": (shade, lambda: shade(radiance=jnp.where(behind, lights.radiance, 0))),
         "background": (lambda: shade(gbuffer=full), shade),
@@ -82,7 +80,8 @@ def pairs() -> dict[str, tuple]:
     }
 
 
-OTHER_PICTURES = ("lights behind the object", "background", "no creases")  # what is skipped was visible
+# What is skipped was visible.
+OTHER_PICTURES = ("no specular lobe", "lights behind the object", "background", "no creases")
 
 
 def main() -> None:
