@@ -13,7 +13,8 @@ from jax import lax
 _LEAST_PIXELS = 1 << 17  # smaller images are not worth another compilation
 _WORTH = 0.8  # nor are parts larger than this
 _SIXTEENTHS = (4, 6, 8, 10, 11, 12, 14, 15, 16)  # 15 holds what `frame_mesh` frames, with its margin
-_GRID = 4  # positions are multiples: the blocks of the fast diffusion stay where they are; sizes left out of twice that
+_GRID = 4  # positions are multiples: the blocks of the fast diffusion stay where they are
+_ROUNDING = 8  # of what is left out of a side, downwards; a multiple of the grid
 
 
 def covering_part(mask) -> tuple[tuple[int, int], tuple[int, int]] | None:
@@ -34,7 +35,7 @@ def _span(used) -> tuple[int, int] | None:
     if not places.size:
         return None
     for part in _SIXTEENTHS:
-        outside = len(used) * (16 - part) // 16 // (2 * _GRID) * (2 * _GRID)
+        outside = len(used) * (16 - part) // 16 // _ROUNDING * _ROUNDING
         length = len(used) - outside
         first = min(places[0] // _GRID * _GRID, outside)
         if first + length > places[-1]:

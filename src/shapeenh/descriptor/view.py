@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -96,7 +96,7 @@ def principal_directions(hessian):
 # ------------------------------------------------------------------------------------------- the descriptor
 
 
-FIELDS = ("hessian", "gradient", "silhouette", "crease", "conductance")
+FIELDS = tuple(field.name for field in dataclasses.fields(Descriptor))
 
 
 def describe(
@@ -231,9 +231,14 @@ def _describe_all(gbuffer, sigma, foreshortening, importance, degrees, *, smooth
 
     # 7: the Hessian, flat at the singular places
     hessian = _hessian(g, places, link_x, link_y, c, foreshortening, bend, always)
-    made = (jnp.stack(hessian, axis=-1), jnp.moveaxis(g, 0, -1), w_s, w_c, c)
-    found: dict[str, Any] = {name: value if name in fields else None for name, value in zip(FIELDS, made, strict=True)}
-    return Descriptor(**found)
+    whole = Descriptor(
+        hessian=jnp.stack(hessian, axis=-1),
+        gradient=jnp.moveaxis(g, 0, -1),
+        silhouette=w_s,
+        crease=w_c,
+        conductance=c,
+    )
+    return replace(whole, **{name: None for name in FIELDS if name not in fields})
 
 
 def _budget(sigma, importance):
