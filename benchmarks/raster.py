@@ -52,7 +52,7 @@ import numpy as np
 import trimesh
 
 import shapeenh as se
-from benchmarks.harness import RESULTS, data, measure, table, write
+from benchmarks.harness import RESULTS, data, machine, measure, table, write
 from benchmarks.peers import raster as peers
 from shapeenh.buffers.visibility import visible_triangles
 from shapeenh.types import replace
@@ -218,11 +218,14 @@ def run_workers(options) -> dict:
 
 
 def add(found: dict, file: Path) -> dict:
-    """What was found, and what the file has of other scenes, calls and peers."""
+    """What was found, and what the file has of other scenes, calls and peers, measured on the same machine."""
     keys = (*SCENE, "call", "by")
-    there = json.loads(file.read_text()) if file.exists() else {"rows": []}
+    there = json.loads(file.read_text()) if file.exists() else {}
+    if there and there["machine"] != machine():
+        print(f"nothing of {file.name} stays: it is from another machine or other versions")
+        there = {}
     new = {tuple(row[k] for k in keys) for row in found["rows"]}
-    kept = [row for row in there["rows"] if tuple(row[k] for k in keys) not in new]
+    kept = [row for row in there.get("rows", []) if tuple(row[k] for k in keys) not in new]
     return {
         "rows": sorted(kept + found["rows"], key=lambda row: (-row["cores"], row["mesh"], row["triangles"])),
         "missing": found["missing"],
@@ -302,7 +305,7 @@ def main() -> None:
     parser.add_argument("--prototype", metavar="FOLDER")
     parser.add_argument("--no-peers", action="store_true")
     parser.add_argument("--all", action="store_true")
-    parser.add_argument("--add", action="store_true", help="to the results that are there")
+    parser.add_argument("--add", action="store_true", help="to this machine's results that are there")
     parser.add_argument("--worker", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--file", help=argparse.SUPPRESS)
     options = parser.parse_args()

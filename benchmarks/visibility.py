@@ -61,15 +61,15 @@ def brute_force(mesh: se.Mesh, camera: se.Camera, height: int, width: int, *, sn
 BOX = (np.ceil, np.min), (lambda a: np.floor(a) + 1, np.max)
 
 
-def rows_of(name: str, mesh: se.Mesh, size: str) -> list[dict]:
+def rows_of(name: str, mesh: se.Mesh, size: str, absent: dict[str, str]) -> list[dict]:
+    """Ours and the peers that are here; `absent` gets the others, with the reason."""
     width, height = (int(n) for n in size.split("x"))
     camera = se.frame_mesh(mesh, direction=(0.34, 0.26, 0.90), aspect=width / height)
     exact, snapped = (brute_force(mesh, camera, height, width, snap=snap) for snap in (False, True))
     calls = {OURS: lambda: se.rasterize(mesh, camera, height=height, width=width).triangle}
     others, missing = peers.calls(mesh, camera, height, width)
     calls |= {row.split(": ")[1]: call for row, call in others.items() if row.startswith("ids")}
-    for who, why in missing.items():
-        print(f"not here: {who} ({why})")
+    absent |= missing
     rows = []
     for who, times in harness.measure(calls).items():
         found = peers.read_ids(calls[who](), height, width)
@@ -99,11 +99,14 @@ def main() -> None:
     parser.add_argument("meshes", nargs="*", type=Path)
     parser.add_argument("--sizes", nargs="+", default=["400x300", "800x600", "1600x1200"])
     arguments = parser.parse_args()
-    rows = []
+    rows: list[dict] = []
+    missing: dict[str, str] = {}
     for name, mesh in harness.meshes(arguments.meshes).items():
         for size in arguments.sizes:
-            rows += rows_of(name, mesh, size)
+            rows += rows_of(name, mesh, size, missing)
     print(harness.table(rows))
+    for who, why in missing.items():
+        print(f"not here: {who} ({why})")
     said = conclude(rows)
     series: dict[str, list] = {}
     first = rows[0]["mesh"]
@@ -113,7 +116,7 @@ def main() -> None:
     title, error = f"Visibility of {first}, beside peers", "share of pixels with another face than exact"
     default = f"{OURS} {arguments.sizes[min(1, len(arguments.sizes) - 1)]}"
     harness.pareto("visibility", series, default=default, title=title, error=error)
-    print(harness.write("visibility", rows, answer=said))
+    print(harness.write("visibility", rows, missing=missing, answer=said))
     print(said)
 
 
