@@ -10,6 +10,7 @@ The goal is a ratio of 3.
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -24,8 +25,8 @@ REACH = 8  # px, of a brush whose radius is not known
 GOAL = 3.0
 
 
-def stages(mesh, *, width: int, height: int, count: int) -> list[tuple]:
-    """(stage, in what, function of a dict of arguments, the arguments)."""
+def stages(mesh, *, width: int, height: int, count: int) -> tuple[dict, list[tuple]]:
+    """(the scene; (stage, in what, function of the scene and a dict of arguments, these arguments), ...)."""
     camera = se.frame_mesh(mesh, direction=(0.34, 0.26, 0.90), aspect=width / height)
     size = {"height": height, "width": width}
     world = se.sample_environment(se.procedural_studio(), count)
@@ -39,56 +40,60 @@ def stages(mesh, *, width: int, height: int, count: int) -> list[tuple]:
     image = se.shade_warped(gbuffer, descriptor, lights, material, alpha=ALPHA * scale)
     style = se.style_brush("ink", "valley", height=height)
     number = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
-    shape = {"vertices": mesh.vertices, "normals": mesh.normals, "camera": camera}
+    scene = {"mesh": mesh, "camera": camera, "world": world, "material": material, "gbuffer": gbuffer}
+    scene |= {"descriptor": descriptor, "light": lights.direction, "field": field, "profile": profile}
 
-    def solid(v):
-        return replace(mesh, vertices=v["vertices"], normals=v["normals"])
+    def solid(s, v):
+        mesh = s["mesh"]
+        return replace(mesh, vertices=v.get("vertices", mesh.vertices), normals=v.get("normals", mesh.normals))
 
-    def described(v):
+    def described(s, v):
+        gbuffer = s["gbuffer"]
         return se.describe(replace(gbuffer, normal=v.get("normal", gbuffer.normal)), sigma=v["sigma"]).hessian
 
-    def shaded(v):
+    def shaded(s, v):
+        gbuffer, descriptor = s["gbuffer"], s["descriptor"]
         g = replace(gbuffer, normal=v.get("normal", gbuffer.normal))
         d = replace(descriptor, hessian=v.get("hessian", descriptor.hessian))
-        return g, d, se.Lights(lights.direction, v["radiance"]), v["material"]
+        return g, d, se.Lights(s["light"], v["radiance"]), v["material"]
 
-    def warped(v):
-        return se.shade_warped(*shaded(v), alpha=v["alpha"], gamma=v["gamma"])
+    def warped(s, v):
+        return se.shade_warped(*shaded(s, v), alpha=v["alpha"], gamma=v["gamma"])
 
-    def scaled(v):
+    def scaled(s, v):
         gammas = {"gamma_diffuse": v["gamma"], "gamma_specular": v["gamma"]}
-        return se.shade_scaled(*shaded(v), invariant=v["invariant"], anisotropy=v["anisotropy"], **gammas)
+        return se.shade_scaled(*shaded(s, v), invariant=v["invariant"], anisotropy=v["anisotropy"], **gammas)
 
-    def framed(v):
-        light = se.Lights(world.direction, v["radiance"])
-        return se.render(solid(shape | v), camera, light, material, se.LightWarp(v["alpha"]), sigma=SIGMA, **size)
+    def framed(s, v):
+        light = se.Lights(s["world"].direction, v["radiance"])
+        warp = se.LightWarp(v["alpha"])
+        return se.render(solid(s, v), s["camera"], light, s["material"], warp, sigma=SIGMA, **size)
 
-    def resolved(v):
-        g = se.render_gbuffer(solid(v), v["camera"], **size)
+    def resolved(s, v):
+        g = se.render_gbuffer(solid(s, v), v["camera"], **size)
         return g.normal, g.position
 
-    def plain(v):
-        g, _, light, stuff = shaded(v)
+    def plain(s, v):
+        g, _, light, stuff = shaded(s, v)
         return se.shade(g, light, stuff)
 
-    def lined(v):
-        bent = replace(descriptor, hessian=v["hessian"], gradient=v["slope"])
-        f = se.line_field("valley", gbuffer, bent, sigma=v["sigma"])
+    def lined(s, v):
+        bent = replace(s["descriptor"], hessian=v["hessian"], gradient=v["slope"])
+        f = se.line_field("valley", s["gbuffer"], bent, sigma=v["sigma"])
         return f.height, f.direction
 
-    def fitted(v):
-        return se.fit_profile(replace(field, height=v["height"], direction=v["direction"]), least=LEAST).distance
+    def fitted(s, v):
+        return se.fit_profile(replace(s["field"], height=v["height"], direction=v["direction"]), least=LEAST).distance
 
-    def drawn(v):
-        return se.draw_lines(
-            replace(profile, distance=v["distance"]), field, replace(style, radius=v["radius"]), reach=REACH
-        )
+    def drawn(s, v):
+        profile, brush = replace(s["profile"], distance=v["distance"]), replace(style, radius=v["radius"])
+        return se.draw_lines(profile, s["field"], brush, reach=REACH)
 
-    def shown(v):
+    def shown(s, v):
         return se.tone_map(v["image"], exposure=v["exposure"], white=v["white"])
 
-    def measured(v):
-        return se.contrast(v["image"], gbuffer.mask)
+    def measured(s, v):
+        return se.contrast(v["image"], s["gbuffer"].mask)
 
     look = {"alpha": number(ALPHA * scale), "gamma": number(0.2), "radiance": lights.radiance, "material": material}
     tuned = {k: look[k] for k in ("radiance", "material")}
@@ -101,8 +106,8 @@ def stages(mesh, *, width: int, height: int, count: int) -> list[tuple]:
     display = {"image": image, "exposure": number(1.0), "white": number(4.0)}
     lit = {"alpha": number(ALPHA), "radiance": world.radiance}
     solids = {"vertices": mesh.vertices, "normals": mesh.normals}
-    return [
-        ("rasterise and resolve", "vertices, normals, camera", resolved, shape),
+    return scene, [
+        ("rasterise and resolve", "vertices, normals, camera", resolved, solids | {"camera": camera}),
         ("describe", "sigma", described, smooth),
         ("describe", "normals, sigma", described, smooth | {"normal": gbuffer.normal}),
         ("shade", "lights, material", plain, matt),
@@ -120,13 +125,19 @@ def stages(mesh, *, width: int, height: int, count: int) -> list[tuple]:
     ]
 
 
-def loss(function, values):
-    parts = jax.tree.leaves(function(values))
+def loss(function, scene, values):
+    parts = jax.tree.leaves(function(scene, values))
     return sum(jnp.mean(jnp.square(part)) for part in parts)
 
 
-def with_gradient(function):
-    return jax.jit(jax.value_and_grad(lambda values: loss(function, values)))
+def compiled(function):
+    """(the loss, the loss with its gradient), of the scene and the arguments.
+
+    The scene is an argument, too: what is closed over would be a constant, and XLA folds that where it can, in a value
+    more than in its gradient.
+    """
+    value = partial(loss, function)
+    return jax.jit(value), jax.jit(jax.value_and_grad(value, argnums=1))
 
 
 def main() -> None:
@@ -141,12 +152,12 @@ def main() -> None:
     paths = [arguments.mesh] if arguments.mesh else []
     name, mesh = next(iter(harness.meshes(paths, ("armadillo",)).items()))
     rows = []
-    for stage, what, function, given in stages(mesh, width=width, height=height, count=arguments.lights):
-        value = jax.jit(lambda v, f=function: loss(f, v))
-        both = with_gradient(function)
+    scene, found = stages(mesh, width=width, height=height, count=arguments.lights)
+    for stage, what, function, given in found:
+        value, both = compiled(function)
         calls = {
-            "value": lambda f=value, v=given: f(v),
-            "with gradient": lambda f=both, v=given: f(v),
+            "value": lambda f=value, v=given: f(scene, v),
+            "with gradient": lambda f=both, v=given: f(scene, v),
         }
         times = harness.measure(calls, seconds=4)
         ms = {call: found["median_ms"] for call, found in times.items()}

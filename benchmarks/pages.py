@@ -42,10 +42,11 @@ def calls(mesh) -> dict:
     """What is timed: a frame, gradients, and G-buffers whose time is mostly writing."""
     found, _ = frame.stages(mesh, se.procedural_studio(), width=800, height=600, count=54)
     some = {name: found[name] for name in ("frame", "frame, value and gradient")}
-    for stage, _, function, given in gradients.stages(mesh, width=800, height=600, count=54):
+    scene, stages = gradients.stages(mesh, width=800, height=600, count=54)
+    for stage, _, function, given in stages:
         if stage in GRADIENTS:  # the last of a name: the one in most arguments
-            both = gradients.with_gradient(function)
-            some[f"{stage}, value and gradient"] = lambda f=both, g=given: f(g)
+            _, both = gradients.compiled(function)
+            some[f"{stage}, value and gradient"] = lambda f=both, g=given: f(scene, g)
     for width, height in ((1920, 1080), (3840, 2160)):
         camera = se.frame_mesh(mesh, aspect=width / height)
         some[f"G-buffer, {width} x {height}"] = lambda c=camera, w=width, h=height: se.render_gbuffer(

@@ -2,18 +2,20 @@
 
 The weight of a silhouette saturates: a few hundred pixels of an image have a derivative, and which ones is known at run
 time. Steps of a diffusion keep the jumps at a few links; stencils are pulled back in the tiles around a few pixels.
-Imports nothing of ours.
+Imports `fusion` only.
 """
 
 from __future__ import annotations
 
-from functools import reduce
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
+
+from shapeenh.fusion import stored
 
 
 def steep(weight):
@@ -75,6 +77,10 @@ def at_ends(planes, places):
     return tuple((at(planes, begin), at(planes, jnp.minimum(begin + by, last))) for begin, by in ends)
 
 
+def _add_at(plane, place, values):
+    return plane.reshape(-1).at[place].add(values, mode="promise_in_bounds").reshape(plane.shape)
+
+
 def jumps_at(planes, places):
     """The differences of planes [C, H, W] across a few links, [C, N]; 0 at the last pixel."""
     return tuple(end - begin for begin, end in at_ends(planes, places))
@@ -86,73 +92,70 @@ def put_back(few, border_x, border_y):
         return border_x, border_y
 
     def put(border, value, place):
-        return border.reshape(-1).at[place].add(value - lax.stop_gradient(value)).reshape(border.shape)
+        return _add_at(border, place, value - lax.stop_gradient(value))
 
     return tuple(map(put, (border_x, border_y), *few))
 
 
 # ------------------------------------------------------------------------------------------- tiles
 #
-# Tiles are cut out with a margin, `_BATCH` at a time, and laid side by side as one image: kernels run along its rows.
+# Small tiles are cut out with a margin, `_BATCH` at a time, and laid side by side as one image: kernels run along its
+# rows. What a tile's neighbour in that image changes are margins, which are not used.
 
-_TILE = 16  # px; smaller ones hold fewer pixels without a derivative, larger ones have less margin
-_BATCH = 32  # tiles at a time, enough for a kernel to be worth its call
-
-
-def spread(flags, reach: int):
-    """[H, W] flags set in the square of pixels up to `reach` px away, too."""
-    for axis in (0, 1):
-        padded = jnp.pad(flags, [(reach, reach) if i == axis else (0, 0) for i in (0, 1)])
-        parts = [lax.slice_in_dim(padded, i, i + flags.shape[axis], axis=axis) for i in range(2 * reach + 1)]
-        flags = reduce(jnp.logical_or, parts)
-    return flags
+_TILE = 4  # px; smaller ones are more work to list, larger ones hold more pixels without a derivative
+_BATCH = 64  # tiles at a time, enough for a kernel to be worth its call
 
 
-def pull_near(flags, reach: int, function, arrays, fixed, cotangents):
-    """What `cotangents` of `function(*arrays, *fixed)` pull back to `arrays`, those of flagged pixels and some more.
+def pull_from(flags, reach: int, function, arrays, fixed, cotangents, always):
+    """What `cotangents` of `function(*arrays, *fixed)` at flagged pixels, and some more, pull back to `arrays`.
 
     flags: [H, W] bool; arrays, fixed: tuples of images [H, W]; function: to a tuple of such, whose values depend on
-        pixels up to `reach` away, and on what is outside of the image as if it were 0; cotangents: a tuple of images.
+        pixels up to `reach` away, and on what is outside of the image as if it were 0; cotangents: a tuple of images;
+        always: a true predicate unknown at compile time, for `stored`.
     *Static*: reach.
     Returns a tuple of [H, W], like `arrays`. The time follows the number of tiles with a flag.
     """
+    return _pull_tiles(flags, reach, False, function, arrays, fixed, cotangents, always)
 
+
+def pull_to(flags, reach: int, function, arrays, fixed, cotangents, always):
+    """As `pull_from`: what all `cotangents` pull back to `arrays` at flagged pixels, and some more; 0 elsewhere."""
+    return _pull_tiles(flags, 2 * reach, True, function, arrays, fixed, cotangents, always)
+
+
+def _pull_tiles(flags, margin: int, to: bool, function, arrays, fixed, cotangents, always):
     def pull(arrays, fixed, cotangents):
         return jax.vjp(lambda *arrays: function(*arrays, *fixed), *arrays)[1](cotangents)
 
-    shape, side = flags.shape, _TILE + 2 * reach
-    if min(shape) < side:
+    side = _TILE + 2 * margin
+    if min(flags.shape) < side:
         return pull(arrays, fixed, cotangents)
     corners, count = _tiles_with(flags)
 
-    def strip(parts):
-        """[_BATCH, side, side] to [side, _BATCH * (side + reach)]: zeros between tiles, as outside of the image."""
-        return jnp.moveaxis(jnp.pad(parts, ((0, 0), (0, 0), (0, reach))), 0, 1).reshape(side, -1)
-
     def batch(i, out):
         corner = lax.dynamic_slice_in_dim(corners, i * _BATCH, _BATCH)
-        start = jnp.clip(corner - reach, 0, jnp.asarray([shape]) - side)
-        cut = jax.vmap(lambda image, start: lax.dynamic_slice(image, start, (side, side)), (None, 0))
-        own = lax.broadcasted_iota(jnp.int32, (_BATCH, 2, side), 2) - (corner - start)[:, :, None]
-        own = (own >= 0) & (own < _TILE)
         there = i * _BATCH + lax.iota(jnp.int32, _BATCH) < count
-        own = own[:, 0, :, None] & own[:, 1, None, :] & there[:, None, None]
-        parts = jax.tree.map(lambda image: cut(image, start), (arrays, fixed, cotangents))
-        bars = tuple(jnp.where(own, bar, 0) for bar in parts[2])
-        found = pull(*jax.tree.map(strip, (*parts[:2], bars)))
-        found = [bar.reshape(side, _BATCH, side + reach) for bar in found]
-
-        def add(k, out):
-            def one(image, bar):
-                before = lax.dynamic_slice(image, start[k], (side, side))
-                return lax.dynamic_update_slice(image, before + bar[:, k, :side], start[k])
-
-            return tuple(map(one, out, found))
-
-        return lax.fori_loop(0, _BATCH, add, out)
+        place, inside, own = stored(always, partial(_strip, flags.shape, margin), corner, there)
+        seen, wanted = (inside, own) if to else (own, inside)
+        cut = lambda images, where: tuple(jnp.where(where, at(image, place), 0) for image in images)  # noqa: E731
+        found = pull(cut(arrays, inside), cut(fixed, inside), cut(cotangents, seen))
+        return tuple(_add_at(total, place, jnp.where(wanted, bar, 0)) for total, bar in zip(out, found, strict=True))
 
     out = tuple(jnp.zeros_like(array) for array in arrays)
     return lax.fori_loop(0, (count + _BATCH - 1) // _BATCH, batch, out)
+
+
+def _strip(shape, margin: int, corner, there):
+    """Of tiles side by side with their margins, `[side, _BATCH * side]`: the places in the image, counted row by row;
+    whether they are within the image; whether they are a tile's own.
+    """
+    side = _TILE + 2 * margin
+    down, right = (lax.broadcasted_iota(jnp.int32, (side, _BATCH, side), axis) - margin for axis in (0, 2))
+    row, column = down + corner[None, :, :1], right + corner[None, :, 1:]
+    inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
+    own = inside & (down >= 0) & (down < _TILE) & (right >= 0) & (right < _TILE) & there[None, :, None]
+    place = jnp.where(inside, row * shape[1] + column, 0)
+    return tuple(a.reshape(side, -1) for a in (place, inside, own))
 
 
 def _tiles_with(flags):

@@ -15,7 +15,7 @@ from jax import lax
 
 from shapeenh.fusion import stored
 from shapeenh.numerics import safe_divide
-from shapeenh.sparse import dense, pull_near, spread, steep
+from shapeenh.sparse import dense, pull_to, steep
 
 # ------------------------------------------------------------------------------------------- neighbours
 
@@ -205,25 +205,29 @@ def derivatives(planes, link_x, link_y, always):
 
 
 @jax.custom_vjp
-def derivatives_beside(planes, link_x, link_y, conductance, always):
-    """`derivatives`, where the links are `links(conductance)` and their derivative is to arrive there.
+def derivatives_beside(stacks, link_x, link_y, conductance, always):
+    """`derivatives` of each of a tuple of tuples of planes, where the links are `links(conductance)` and their
+    derivative is to arrive there.
 
     Gradient: with respect to planes, and to the conductance where that is between 0 and 1 (it has none elsewhere if it
         comes from a smoothstep); in reverse mode.
     """
-    return derivatives(planes, link_x, link_y, always)
+    return tuple(derivatives(planes, link_x, link_y, always) for planes in stacks)
 
 
-def _beside_fwd(planes, link_x, link_y, conductance, always):
+def _beside_fwd(stacks, link_x, link_y, conductance, always):
     wanted = () if conductance.perturbed else None
-    values = jax.tree.map(lambda leaf: leaf.value, (planes, link_x, link_y, conductance, always))
+    values = jax.tree.map(lambda leaf: leaf.value, (stacks, link_x, link_y, conductance, always))
     return derivatives_beside(*values), (*values, wanted)
 
 
 def _beside_bwd(saved, cotangents):
-    planes, link_x, link_y, conductance, always, wanted = saved
-    d_x, d_y = jax.tree.map(dense, cotangents)
-    _, pull = jax.vjp(lambda planes: derivatives(planes, link_x, link_y, always), planes)
+    stacks, link_x, link_y, conductance, always, wanted = saved
+    cotangents = jax.tree.map(dense, cotangents)
+    pulled = []
+    for planes, bars in zip(stacks, cotangents, strict=True):
+        _, pull = jax.vjp(lambda planes: derivatives(planes, link_x, link_y, always), planes)
+        pulled += pull(bars)
     found = None
     if wanted is not None:
 
@@ -232,9 +236,10 @@ def _beside_bwd(saved, cotangents):
             d_x, d_y = derivatives(planes, link_x, link_y, always)
             return *d_x, *d_y
 
-        near = spread(steep(conductance), 2)
-        (found,) = pull_near(near, 2, both, (conductance,), planes, (*d_x, *d_y))
-    return *pull((d_x, d_y)), None, None, found, None
+        bars = [bar for i in (0, 1) for pair in cotangents for bar in pair[i]]  # along x, then along y
+        planes = [plane for planes in stacks for plane in planes]
+        (found,) = pull_to(steep(conductance), 2, both, (conductance,), planes, bars, always)
+    return tuple(pulled), None, None, found, None
 
 
 derivatives_beside.defvjp(_beside_fwd, _beside_bwd, symbolic_zeros=True)

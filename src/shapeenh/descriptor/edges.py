@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from shapeenh.fusion import stored
 from shapeenh.numerics import norm, safe_divide, smoothstep
-from shapeenh.sparse import pull_near, steep
+from shapeenh.sparse import pull_from, steep
 from shapeenh.stencils import WHOLE, shift, window
 
 # A step counts in units of the distance between neighbouring samples on the surface. Shading normals of real meshes are
@@ -125,7 +125,8 @@ def _weight_fwd(always, *planes):
 
 def _weight_bwd(saved, cotangent):
     always, (*planes, on), weight = saved
-    return None, *pull_near(steep(weight), 2, partial(_weight_of, always), tuple(planes), (on,), (cotangent,)), None
+    weight_of = partial(_weight_of, always)
+    return None, *pull_from(steep(weight), 2, weight_of, tuple(planes), (on,), (cotangent,), always), None
 
 
 _weight.defvjp(_weight_fwd, _weight_bwd)

@@ -293,5 +293,5 @@ def _hessian(g, places, link_x, link_y, c, foreshortening, bend, always):
         return unit * (m_xx * u_x + m_xy * u_y), (0.5 * unit) * xy, unit * (m_yx * v_x + m_yy * v_y)
 
     planes = tuple(g) if bend is None else stored(always, lambda g: gradient.to_chart(g, foreshortening, bend), g)
-    d, e = (derivatives_beside(tuple(p), link_x, link_y, c, always) for p in (planes, places))
+    d, e = derivatives_beside((planes, tuple(places)), link_x, link_y, c, always)
     return stored(always, displaced, g, *d, *e, c)
