@@ -23,6 +23,7 @@ from benchmarks.harness import RESULTS
 
 NOT_BENCHMARKS = ("__init__", "__main__", "harness", "tables")
 QUICK = {  # options of scripts whose work `harness.measure` does not bound
+    "batches": ["--size", "160x120", "--count", "2"],
     "coherence": ["--frames", "2", "--height", "100"],
     "descriptor": ["--quick"],
     "diffusion": ["--quick"],

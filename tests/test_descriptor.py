@@ -335,6 +335,32 @@ def test_borders_of_fusion_outlast_constants():
         assert jax.jit(function).lower(0.5).compile().as_text().count(" conditional(") > 0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("axes", [(0, None), pytest.param((None, 0), marks=pytest.mark.thorough)])
+def test_gradients_of_a_batch_are_those_of_its_members(x64, axes):
+    """In normals with one sigma, in sigma with one field of normals: each has its own steps, flanks and tiles."""
+    fields, _ = reference.traced_spheres(24, 32, [((0, 0, -5), 1.0), ((0.8, 0.3, -5.9), 1.4)])
+    gbuffer = buffer(fields)
+
+    @jax.jit
+    def gradients(normal, sigma):
+        def value(normal, sigma):
+            descriptor = se.describe(replace(gbuffer, normal=normal), sigma=sigma)
+            return jnp.sum(descriptor.hessian**2), descriptor.silhouette
+
+        (_, silhouette), found = jax.value_and_grad(value, (0, 1), has_aux=True)(normal, sigma)
+        return found, silhouette
+
+    several = jnp.stack([gbuffer.normal, gbuffer.normal * jnp.asarray([[[0.9, 1.0, 1.0]]])]), jnp.asarray([0.6, 2.4])
+    given = [batch if axis == 0 else batch[1] for batch, axis in zip(several, axes, strict=True)]
+    together, silhouette = jax.jit(jax.vmap(gradients, axes))(*given)
+    assert np.any((silhouette > 0) & (silhouette < 1))
+    for k in range(2):
+        one = gradients(*(batch[k if axis == 0 else 1] for batch, axis in zip(several, axes, strict=True)))[0]
+        for a, b in zip(together, one, strict=True):
+            np.testing.assert_allclose(a[k], b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
+
+
 # ------------------------------------------------------------------------------------------- edge cases
 
 

@@ -107,11 +107,11 @@ _BATCH = 64  # tiles at a time, enough for a kernel to be worth its call
 
 
 def pull_from(flags, reach: int, function, arrays, fixed, cotangents, always):
-    """What `cotangents` of `function(*arrays, *fixed)` at flagged pixels, and some more, pull back to `arrays`.
+    """What `cotangents` of `function(always, *arrays, *fixed)` at flagged pixels, and some more, pull back to `arrays`.
 
     flags: [H, W] bool; arrays, fixed: tuples of images [H, W]; function: to a tuple of such, whose values depend on
-        pixels up to `reach` away, and on what is outside of the image as if it were 0; cotangents: a tuple of images;
-        always: a true predicate unknown at compile time, for `stored`.
+        pixels up to `reach` away, and on what is outside of the image as if it were 0; it closes over no arrays;
+        cotangents: a tuple of images; always: a true predicate unknown at compile time, for `stored`.
     *Static*: reach.
     Returns a tuple of [H, W], like `arrays`. The time follows the number of tiles with a flag.
     """
@@ -124,25 +124,30 @@ def pull_to(flags, reach: int, function, arrays, fixed, cotangents, always):
 
 
 def _pull_tiles(flags, margin: int, to: bool, function, arrays, fixed, cotangents, always):
-    def pull(arrays, fixed, cotangents):
-        return jax.vjp(lambda *arrays: function(*arrays, *fixed), *arrays)[1](cotangents)
+    def pull(arrays, fixed, cotangents, always):
+        return jax.vjp(lambda *arrays: function(always, *arrays, *fixed), *arrays)[1](tuple(cotangents))
 
-    side = _TILE + 2 * margin
-    if min(flags.shape) < side:
-        return pull(arrays, fixed, cotangents)
-    corners, count = _tiles_with(flags)
+    if min(flags.shape) < _TILE + 2 * margin:
+        return pull(arrays, fixed, cotangents, always)
 
-    def batch(i, out):
-        corner = lax.dynamic_slice_in_dim(corners, i * _BATCH, _BATCH)
-        there = i * _BATCH + lax.iota(jnp.int32, _BATCH) < count
-        place, inside, own = stored(always, partial(_strip, flags.shape, margin), corner, there)
-        seen, wanted = (inside, own) if to else (own, inside)
-        cut = lambda images, where: tuple(jnp.where(where, at(image, place), 0) for image in images)  # noqa: E731
-        found = pull(cut(arrays, inside), cut(fixed, inside), cut(cotangents, seen))
-        return tuple(_add_at(total, place, jnp.where(wanted, bar, 0)) for total, bar in zip(out, found, strict=True))
+    @jax.custom_batching.sequential_vmap  # each of a batch has its own number of tiles
+    def run(flags, arrays, fixed, cotangents, always):
+        corners, count = _tiles_with(flags)
 
-    out = tuple(jnp.zeros_like(array) for array in arrays)
-    return lax.fori_loop(0, (count + _BATCH - 1) // _BATCH, batch, out)
+        def batch(i, out):
+            corner = lax.dynamic_slice_in_dim(corners, i * _BATCH, _BATCH)
+            there = i * _BATCH + lax.iota(jnp.int32, _BATCH) < count
+            place, inside, own = stored(always, partial(_strip, flags.shape, margin), corner, there)
+            seen, wanted = (inside, own) if to else (own, inside)
+            cut = lambda images, where: tuple(jnp.where(where, at(image, place), 0) for image in images)  # noqa: E731
+            bars = pull(cut(arrays, inside), cut(fixed, inside), cut(cotangents, seen), always)
+            bars = (jnp.where(wanted, bar, 0) for bar in bars)
+            return tuple(_add_at(total, place, bar) for total, bar in zip(out, bars, strict=True))
+
+        out = tuple(jnp.zeros_like(array) for array in arrays)
+        return lax.fori_loop(0, (count + _BATCH - 1) // _BATCH, batch, out)
+
+    return run(flags, arrays, fixed, cotangents, always)
 
 
 def _strip(shape, margin: int, corner, there):

@@ -231,7 +231,7 @@ def _beside_bwd(saved, cotangents):
     found = None
     if wanted is not None:
 
-        def both(conductance, *planes):
+        def both(always, conductance, *planes):
             link_x, link_y = links(conductance)
             d_x, d_y = derivatives(planes, link_x, link_y, always)
             return *d_x, *d_y

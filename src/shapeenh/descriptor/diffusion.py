@@ -180,21 +180,34 @@ def _diffuse_fwd(stacks, conductance, links, budget, flank, always, levels, sure
     moving = {i: leaf.value for i, leaf in enumerate(jax.tree.leaves(arguments)) if leaf.perturbed}
     followed = flank is not None and conductance.perturbed
     arguments, links, flank, always = jax.tree.map(lambda leaf: leaf.value, (arguments, links, flank, always))
-    places = places_of(flank, most) if followed else None
-    out, pull = _pull(moving, arguments, links, places, always, levels, sure)
-    return out, (pull, moving, arguments, links, flank if followed else None, always)
+    flank = flank if followed else None
+    structures: list[Any] = []
+
+    @jax.custom_batching.sequential_vmap
+    def run(moving, arguments, links, flank, always):
+        places = None if flank is None else places_of(flank, most)
+        out, pull = _pull(moving, arguments, links, places, always, levels, sure)
+        leaves, structure = jax.tree.flatten(pull)
+        structures.append(structure)
+        return out, leaves
+
+    out, leaves = run(moving, arguments, links, flank, always)
+    return out, (jax.tree.unflatten(structures[-1], leaves), moving, arguments, links, flank, always)
 
 
 def _diffuse_bwd(levels, sure, most, saved, cotangents):
-    pull, moving, arguments, links, flank, always = saved
-    cotangents = tuple(dense(c) for c in cotangents)
-    if flank is None:
-        (found,) = pull(cotangents)
-    else:
-        with_all = lambda bars: _pull(moving, arguments, links, None, always, levels, sure)[1](bars)  # noqa: E731
+    structure: Any = jax.tree.structure(saved[2])
+
+    @jax.custom_batching.sequential_vmap
+    def run(saved, cotangents):
+        pull, moving, arguments, links, flank, always = saved
+        if flank is None:
+            return pull(cotangents)[0]
+        with_all = lambda bars: _pull(moving, arguments, links, None, always, levels, sure)[1](bars)[0]  # noqa: E731
         enough = jnp.maximum(*(jnp.sum(flags) for flags in flank)) <= most
-        (found,) = lax.cond(enough, pull, with_all, cotangents)
-    structure: Any = jax.tree.structure(arguments)
+        return lax.cond(enough, lambda bars: pull(bars)[0], with_all, cotangents)
+
+    found = run(saved, tuple(dense(c) for c in cotangents))
     stacks, conductance, budget = structure.unflatten([found.get(i) for i in range(structure.num_leaves)])
     return stacks, conductance, None, budget, None, None
 

@@ -6,8 +6,6 @@ normals already predict is taken off first. Normals and positions are triples of
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 
@@ -125,8 +123,7 @@ def _weight_fwd(always, *planes):
 
 def _weight_bwd(saved, cotangent):
     always, (*planes, on), weight = saved
-    weight_of = partial(_weight_of, always)
-    return None, *pull_from(steep(weight), 2, weight_of, tuple(planes), (on,), (cotangent,), always), None
+    return None, *pull_from(steep(weight), 2, _weight_of, tuple(planes), (on,), (cotangent,), always), None
 
 
 _weight.defvjp(_weight_fwd, _weight_bwd)
