@@ -207,7 +207,7 @@ def derivatives(planes, link_x, link_y, always):
 @jax.custom_vjp
 def derivatives_beside(stacks, link_x, link_y, conductance, always):
     """`derivatives` of each of a tuple of tuples of planes, where the links are `links(conductance)` and their
-    derivative is to arrive there.
+    derivative is to arrive there. One tuple after the other holds less memory at a time.
 
     Gradient: with respect to planes, and to the conductance where that is between 0 and 1 (it has none elsewhere if it
         comes from a smoothstep); in reverse mode.
@@ -223,11 +223,10 @@ def _beside_fwd(stacks, link_x, link_y, conductance, always):
 
 def _beside_bwd(saved, cotangents):
     stacks, link_x, link_y, conductance, always, wanted = saved
-    cotangents = jax.tree.map(dense, cotangents)
-    pulled = []
-    for planes, bars in zip(stacks, cotangents, strict=True):
-        _, pull = jax.vjp(lambda planes: derivatives(planes, link_x, link_y, always), planes)
-        pulled += pull(bars)
+    planes = tuple(jax.tree.leaves(stacks))
+    d_x, d_y = ([dense(bar) for pair in cotangents for bar in pair[i]] for i in (0, 1))
+    _, pull = jax.vjp(lambda planes: derivatives(planes, link_x, link_y, always), planes)
+    pulled = jax.tree.unflatten(jax.tree.structure(stacks), *pull((tuple(d_x), tuple(d_y))))
     found = None
     if wanted is not None:
 
@@ -236,10 +235,8 @@ def _beside_bwd(saved, cotangents):
             d_x, d_y = derivatives(planes, link_x, link_y, always)
             return *d_x, *d_y
 
-        bars = [bar for i in (0, 1) for pair in cotangents for bar in pair[i]]  # along x, then along y
-        planes = [plane for planes in stacks for plane in planes]
-        (found,) = pull_to(steep(conductance), 2, both, (conductance,), planes, bars, always)
-    return tuple(pulled), None, None, found, None
+        (found,) = pull_to(steep(conductance), 2, both, (conductance,), planes, (*d_x, *d_y), always)
+    return pulled, None, None, found, None
 
 
 derivatives_beside.defvjp(_beside_fwd, _beside_bwd, symbolic_zeros=True)
