@@ -317,24 +317,15 @@ def _adjoint(plan: Plan, wanted: frozenset, mask, inputs, direction, radiance, c
                 bar, w_bar = kernel.adjoint(plan.model, form, light, along)
                 return {name: bar[name] for name in used}, w_bar
 
-            def added(planes_bar, forms_bar, rows):
-                # The planes of a form together: one kernel, and one that is large enough for XLA to share among cores.
-                light, _ = _unpack(rows)
-                factors = {
-                    form: jnp.stack([light[coefficient][..., 0] for _, coefficient in of_form], axis=-1)
-                    for form, of_form in reached.items()
-                }
-                return {form: _add_weighted(planes_bar[form], forms_bar[form], factors[form]) for form in reached}
-
-            def summed(sums, weight, rows):
-                _, colour = _unpack(rows)
-                return tuple(_add_weighted(*pair, colour) for pair in zip(sums, weight, strict=True))
-
+            light, colour = _unpack(rows)
             if used:
                 forms_bar, w_bar = stored(on, derivatives, planes, rows, known)
-                planes_bar = stored(then, added, planes_bar, {form: forms_bar[form] for form in reached}, rows)
+                # The planes of a form together: one kernel, and one that is large enough for XLA to share among cores.
+                for form, of_form in reached.items():
+                    factors = jnp.stack([light[coefficient][..., 0] for _, coefficient in of_form], axis=-1)
+                    planes_bar = planes_bar | {form: _add_weighted(planes_bar[form], forms_bar[form], factors)}
             if images or constants:
-                sums = stored(then, summed, sums, weight, rows)
+                sums = tuple(_add_weighted(*pair, colour) for pair in zip(sums, weight, strict=True))
             light_bar = dict(light_bar)
             if "radiance" in wanted:
                 lanes = stored(then, _products, weight, sums_bar)
