@@ -65,16 +65,26 @@ def _prologue(model: Model, inputs, on):
     if "albedo" in inputs:
         diffuse = diffuse * inputs["albedo"]
     facing = brdf.DIFFUSE * (1 - (1 - 0.5 * nz) ** 5) * factor
-    diffuse = diffuse * facing[:, None]
+    diffuse = diffuse * _to_channels(facing)
     if not model.glossy:
         return planes, (diffuse,)
-    specular, shininess = inputs["specular"], inputs["shininess"]
-    planes["shininess"] = shininess[:, 0]
-    peak = (shininess + 1) / (8 * np.pi) * factor[:, None]
+    specular, shininess = inputs["specular"], inputs["shininess"][:, 0]
+    planes["shininess"] = shininess
+    peak = (shininess + 1) / (8 * np.pi) * factor
     if not model.tinted:
         planes["reflectance"] = specular[:, 0]
-        return planes, (diffuse * (1 - specular), peak)
-    return planes, (diffuse * (1 - specular), specular * peak, (1 - specular) * peak)
+        return planes, (diffuse * _to_channels(1 - specular[:, 0]), peak)
+    return planes, (diffuse * (1 - specular), specular * _to_channels(peak), (1 - specular) * _to_channels(peak))
+
+
+@jax.custom_vjp
+def _to_channels(plane):
+    """(block, 64) as (block, 3, 64). In reverse mode the channels are added one by one: XLA on CPU hands a sum along a
+    short axis to a library, and waits for it."""
+    return jnp.broadcast_to(plane[:, None], (plane.shape[0], 3, plane.shape[1]))
+
+
+_to_channels.defvjp(lambda plane: (_to_channels(plane), None), lambda _, bar: (bar[:, 0] + bar[:, 1] + bar[:, 2],))
 
 
 def _inverse_tensor(xx, xy, yy, convex, concave):
@@ -83,6 +93,7 @@ def _inverse_tensor(xx, xy, yy, convex, concave):
 
 
 def _epilogue(totals, factors):
+    factors = (_to_channels(factor) if factor.ndim == 2 else factor for factor in factors)
     return sum(total * factor for total, factor in zip(totals, factors, strict=True))
 
 
