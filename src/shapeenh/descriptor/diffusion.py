@@ -181,9 +181,9 @@ def _diffuse_fwd(stacks, conductance, links, budget, flank, always, levels, sure
     followed = flank is not None and conductance.perturbed
     arguments, links, flank, always = jax.tree.map(lambda leaf: leaf.value, (arguments, links, flank, always))
     flank = flank if followed else None
-    structures: list[Any] = []
+    structures: list[Any] = []  # of `pull`, which leaves `run` as arrays
 
-    @jax.custom_batching.sequential_vmap
+    @jax.custom_batching.sequential_vmap  # as in `diffuse_stacks`
     def run(moving, arguments, links, flank, always):
         places = None if flank is None else places_of(flank, most)
         out, pull = _pull(moving, arguments, links, places, always, levels, sure)
