@@ -16,6 +16,7 @@ import shapeenh as se
 from shapeenh.descriptor.diffusion import levels_for
 from tests.absences import ABSENCES, NOT_NUMERIC
 from tests.claims import CLAIMS
+from tests.programs import Counted
 from tests.scenes import SCENES, SIZE, make_scene
 
 # The maths is tested here, not what the compiler makes of it: without LLVM's passes it compiles a third faster.
@@ -107,13 +108,13 @@ def entries(table):
 @pytest.mark.parametrize("claim", **entries(CLAIMS))
 def test_gradients_are_what_the_table_claims(claim, x64):
     value = reduced(claim)
-    compiled = jax.jit(value, compiler_options=FAST)
-    gradient = jax.jit(jax.value_and_grad(value, argnums=1, has_aux=True), compiler_options=FAST)
+    compiled = Counted(value, compiler_options=FAST)
+    gradient = Counted(jax.value_and_grad(value, argnums=1, has_aux=True), compiler_options=FAST)
     moved = collections.defaultdict(bool)
     for kind, scene in scenes().items():
         check(claim, compiled, gradient, scene, kind, moved)
     assert all(moved.values()), f"gradients that are 0 on every scene: {moved}"
-    assert compiled._cache_size() == gradient._cache_size() == 1  # one program for all scenes and steps
+    assert compiled.traces == gradient.traces == 1  # one program for all scenes and steps
 
 
 # ------------------------------------------------------------------------------------------- absences

@@ -16,6 +16,7 @@ import pytest
 
 import shapeenh as se
 from tests import hostile
+from tests.programs import Counted
 
 SHAPE = 9, 11
 TINY = (1, 1), (1, 7), (6, 1)
@@ -288,8 +289,8 @@ def program(function, gradient: bool):
         return sum(jnp.sum(rng.uniform(0.1, 1, leaf.shape).astype(leaf.dtype) * leaf) for leaf in leaves), out
 
     if gradient:
-        return jax.jit(jax.value_and_grad(value, argnums=(0, 2), has_aux=True))
-    return jax.jit(lambda *args: value(*args)[1])
+        return Counted(jax.value_and_grad(value, argnums=(0, 2), has_aux=True))
+    return Counted(lambda *args: value(*args)[1])
 
 
 def run(function, i, p, gradient=True):
@@ -348,7 +349,7 @@ def test_pictures_and_gradients_of_hostile_inputs_are_finite(function, kind, dra
     i, p = hostile.images(draw, SHAPE, np.float32), parameters(draw, np.float32)
     (_, out), gradients = run(function, i, p)
     check_outputs(out, SHAPE, np.float32)
-    assert program(function, True)._cache_size() == 1
+    assert program(function, True).traces == 1
     bad = not_finite(gradients)
     assert not bad or overflows(function, i, p)
 

@@ -13,6 +13,7 @@ import pytest
 import shapeenh as se
 from tests import hostile
 from tests.absences import NOT_NUMERIC
+from tests.programs import Counted
 
 SHAPE = 9, 11
 
@@ -24,14 +25,14 @@ def checked(function):
         out = [leaf for leaf in jax.tree.leaves(function(floats, *held)) if hostile.is_float(leaf)]
         return sum(jnp.sum(leaf) for leaf in out), out
 
-    both = jax.jit(jax.value_and_grad(value, argnums=0, has_aux=True))
+    both = Counted(jax.value_and_grad(value, argnums=0, has_aux=True))
 
     def check(floats, *held, about=""):
         (_, out), gradients = both(floats, *held)
         assert all(np.all(np.isfinite(leaf)) for leaf in out), about
         for path, leaf in jax.tree_util.tree_leaves_with_path(gradients):
             assert np.all(np.isfinite(leaf)), f"{about}: gradient in {jax.tree_util.keystr(path)}"
-        assert both._cache_size() == 1
+        assert both.traces == 1
         return out
 
     return check
