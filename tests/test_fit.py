@@ -433,6 +433,39 @@ def test_a_target_out_of_reach_names_the_range():
     assert high == pytest.approx(max(values), rel=0.01)
 
 
+@pytest.mark.parametrize("start", [0.0, 0.31, 1.0])
+@pytest.mark.parametrize("target", [0.36, 0.12])
+def test_a_narrow_peak_or_dip_is_found(start, target):
+    """Between the points of a survey, and so narrow that no climb from any of them sees it."""
+
+    def peaked(x):
+        return (
+            1
+            + (0.5 + 0.3 * jnp.exp(-jnp.square((x - 0.81) / 0.01)) - 0.4 * jnp.exp(-jnp.square((x - 0.57) / 0.01)))
+            * HEIGHT
+        )
+
+    fitted = se.fit_contrast(peaked, target, start, mask=MASK, bounds=(0.0, 1.0))
+    assert fitted.converged
+    assert contrast_of(peaked(fitted.parameters)) == pytest.approx(target, rel=1.1e-4)
+
+
+@pytest.mark.parametrize("start", [(0.6, 0.5), (0.0, 0.0), (1.0, 1.0)])
+def test_a_dip_of_two_parameters_beside_a_flat_bound_is_found(start):
+    """As of a faceted object, whose contrast is least at a strength far below the first point of a survey."""
+
+    def render(p):
+        x, y = p["x"], p["y"]
+        return 1 + (0.5 + 0.3 * x / (x + 0.05) * (1.2 - y) - 1.5 * x * y * jnp.exp(-x / 0.02)) * HEIGHT * 0.6
+
+    mesh = [contrast_of(render({"x": x, "y": y})) for x in np.linspace(0, 0.1, 41) for y in (0.9, 0.95, 1.0)]
+    target = min(mesh) + 0.02 * (contrast_of(render({"x": 0.0, "y": 0.0})) - min(mesh))
+    fitted = se.fit_contrast(
+        render, target, dict(zip("xy", start, strict=True)), mask=MASK, bounds={"x": (0.0, 1.0), "y": (0.0, 1.0)}
+    )
+    assert fitted.converged
+
+
 def test_a_jump_across_the_target_is_not_converged():
     def jumping(alpha):
         return 1 + jnp.where(alpha > 30.7, 0.5, 0.1) * HEIGHT
@@ -669,6 +702,28 @@ def test_pixels_that_are_not_finite_do_not_count(dtype):
     found = se.fit_image(shaded, picture, start, mask=MASK, bounds=BOUNDS)
     assert found.converged is True
     assert found.parameters["alpha"] == pytest.approx(33, rel=1e-3)
+
+
+def test_a_picture_without_finite_pixels_is_no_match():
+    picture = hidden_picture(np.dtype("float32"))
+    start = {"alpha": 60.0, "gamma": 0.0}
+    with pytest.raises(ValueError, match="reference has no finite pixel under the mask; accepted"):
+        se.fit_image(shaded, np.nan * picture, start, mask=MASK, bounds=BOUNDS)
+    absent = lambda p: jnp.where(p["alpha"] > -50, np.nan, shaded(p))  # noqa: E731
+    for fit, wanted in ((se.fit_image, picture), (se.fit_contrast, 0.25)):
+        with pytest.raises(ValueError, match="render gives no finite pixel under the mask; accepted"):
+            fit(absent, wanted, start, mask=MASK, bounds=BOUNDS)
+    with pytest.raises(ValueError, match="gradient of the picture's measure is not finite; accepted"):
+        se.fit_contrast(lambda p: shaded(p) + jnp.sqrt(0 * p["alpha"]), 0.25, start, mask=MASK, bounds=BOUNDS)
+
+
+def test_pixels_that_a_rendered_picture_lacks_are_no_match(x64):
+    """Else a fit would be best off where it shows least."""
+    alike = np.indices(MASK.shape)[1] < 12
+    render = lambda a: jnp.where(alike, 1.0, jnp.where(a > 60, jnp.nan, of_alpha(a)))  # noqa: E731
+    found = se.fit_image(render, render(33.0), 70.0, mask=MASK, bounds=(0.0, 100.0), starts=9)
+    assert found.converged
+    assert found.parameters == pytest.approx(33, rel=1e-3)
 
 
 def test_a_picture_that_cannot_be_matched_gives_the_nearest(x64, rng):

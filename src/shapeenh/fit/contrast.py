@@ -47,6 +47,7 @@ def contrast(image, mask, *, measure: str = "rms", scale: float = 2.0):
     if len(shape) not in (2, 3):
         raise ValueError(f"image has shape {shape}; accepted is [H, W] or [H, W, 3]")
     checks.check_shape("image", image, (None, None, 3)[: len(shape)])
+    checks.check_real("image", image)
     checks.check_shape("mask", mask, shape[:2])
     if not checks.is_concrete(scale):
         raise ValueError("scale is traced; accepted are plain numbers (it sets the number of blur steps)")

@@ -35,13 +35,20 @@ class FitResult:
 
 
 def picture(render, parameters, arguments, mask, shape=None):
-    """The picture for these parameters, of the mask's size."""
+    """The picture for these parameters, of the mask's size, with something to see where values are known."""
     image = jnp.asarray(render(parameters, *arguments))
     wanted = mask.shape if shape is None else shape
     if image.shape != wanted and (shape is not None or image.shape != (*mask.shape, 3)):
         accepted = f"{wanted}" if shape is not None else f"{mask.shape} or {(*mask.shape, 3)}"
         raise ValueError(f"render gives an image of shape {image.shape}; accepted is {accepted}")
+    if checks.is_concrete(image) and not _any_finite(image, mask):
+        raise ValueError("render gives no finite pixel under the mask; accepted are pictures that show something there")
     return image.astype(checks.float_dtype(image))
+
+
+@jax.jit
+def _any_finite(image, mask):
+    return jnp.any(jnp.isfinite(image) & mask.reshape(*mask.shape, *(1,) * (image.ndim - 2)))
 
 
 def check_mask(mask):

@@ -49,7 +49,10 @@ class Objective:
         self.renders += 1
         with _named_leaks():
             value, gradient = jax.value_and_grad(self.function)(jnp.asarray(u), *self.arguments)
-            return _plain(value), np.asarray(gradient, np.float64)
+            number, slope = _plain(value), np.asarray(gradient, np.float64)
+            if not np.all(np.isfinite(slope)):
+                raise ValueError("the gradient of the picture's measure is not finite; accepted are finite numbers")
+            return number, slope
 
     def traced(self, u, *arguments):
         """For a solver that compiles its loop: there Python is called once, so a callback counts."""

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import direct
 
 from shapeenh import checks
 from shapeenh.fit import solve
@@ -53,8 +54,10 @@ def fit_contrast(
         tolerance: of the contrast, relative to the target.
         max_renders: how many pictures may be rendered.
 
-    Where the solver ends elsewhere (a flat start, a local extremum), the bounds are surveyed for a contrast on the
-    other side of the target; between two such points a continuous contrast meets it.
+    Where the solver ends elsewhere (a flat start, a local extremum), the bounds are searched for a contrast on the
+    other side of the target: by a survey, by climbs from its best points, and then, with most of `max_renders`,
+    everywhere (DIRECT). Between two such points a continuous contrast meets the target. A target is out of reach where
+    all this finds none: peaks of about 1 % of the bounds' width, more with several parameters, may be missed.
 
     Static: measure, solver, tolerance, max_renders. Does not run under `jit` and `vmap`: the course depends on values.
     Returns: `FitResult`; `converged` is False where `max_renders` did not do or the contrast jumps across the target
@@ -128,12 +131,17 @@ def _meet(search, objective, solver, start):
         else:
             _approach(search, objective, solver, start)
         search.survey()
-        _climb(search, 1 if search.best[0] < 0 else -1)
+        sign = 1 if search.best[0] < 0 else -1
+        _climb(search, sign, 2)
     except Stop:
         return
-    with contextlib.suppress(Stop):  # the other end of the range, with what is left of the budget
-        _climb(search, -1 if search.best[0] < 0 else 1)
+    with contextlib.suppress(Stop):
+        _explore(search, sign)
+        _climb(search, sign, 1)
+        _climb(search, -sign, 2)  # the other end of the range
     low, high = search.range
+    if search.met or low <= search.target <= high:
+        return
     raise ValueError(
         f"target is {search.target:g}; accepted are the contrasts that can be reached within the bounds, "
         f"{low:.4g} to {high:.4g} (found in {objective.renders} renders)"
@@ -170,18 +178,37 @@ def _approach(search, objective, solver, start):
 
 
 class _ShareSpent(Exception):
-    """A solver has used its part of the budget; the rest is for the survey."""
+    """A solver has used its part of the budget; the rest is for what comes after it."""
 
 
-def _climb(search, sign):
-    """From the two best points, along the gradient, towards larger (sign 1) or smaller (-1) contrast."""
+def _explore(search, sign):
+    """The whole cube by dividing rectangles (DIRECT, Jones 1993), for larger (sign 1) or smaller (-1) contrast.
+
+    Climbs see the hills that the survey hit; this one finds those between. Most of what is left of the budget.
+    """
+    limit = len(search.points) + int(0.7 * (search.budget - len(search.points)))
+
+    def on_host(place):
+        if len(search.points) >= limit:
+            raise _ShareSpent
+        residual = search.look(place[search.dimension])
+        search.bracket_nearest()
+        return -sign * residual
+
+    with contextlib.suppress(_ShareSpent):
+        dimensions = int(search.dimension.max()) + 1
+        direct(on_host, [(0, 1)] * dimensions, maxfun=search.budget, locally_biased=False, vol_tol=0, len_tol=0)
+
+
+def _climb(search, sign, count):
+    """From the best `count` points, along the gradient, towards larger (sign 1) or smaller (-1) contrast."""
 
     def on_host(u):
         residual, slope = search.look_with_slope(u)
         search.bracket_nearest()
         return -sign * residual, -sign * slope
 
-    for _, u in sorted(search.points, key=lambda point: -sign * point[0])[:2]:
+    for _, u in sorted(search.points, key=lambda point: -sign * point[0])[:count]:
         solve.minimise("scipy", on_host, None, u, (), tolerance=1e-7, limit=30, stepped=search.stepped)
 
 

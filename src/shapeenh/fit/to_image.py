@@ -37,7 +37,8 @@ def fit_image(
     Args:
         render, parameters, bounds, arguments: as in `fit_contrast`.
         reference: [H, W, 3] or [H, W], of the shape that `render` gives.
-        mask: [H, W], what is compared; pixels that are not finite in either picture do not count.
+        mask: [H, W], what is compared; pixels that are not finite in the reference do not count, those that are not in
+            a rendered picture are black.
         solver: the jaxopt solvers "scipy" (SciPy's L-BFGS-B), "lbfgsb" and "projected"; optax's "adam"; or a function
             `solver(fun, start, bounds, *arguments)` -> [n] that minimises `fun(u, *arguments)` over the unit cube.
         starts: how many starts may be tried, the given one first, then points that fill the bounds evenly; the best
@@ -65,6 +66,9 @@ def fit_image(
             f"reference has shape {shape}; accepted is [H, W] or [H, W, 3] of the mask's size {mask.shape}"
         )
     reference = jnp.asarray(reference, checks.float_dtype(reference))
+    mask = mask & np.all(np.isfinite(np.asarray(reference).reshape(*mask.shape, -1)), axis=-1)
+    if not mask.any():
+        raise ValueError("reference has no finite pixel under the mask; accepted is a picture with some")
     box = Box(parameters, bounds)
 
     def difference(u, *arguments):
@@ -139,14 +143,14 @@ class _Descent:
 
 
 def _difference(image, reference, mask):
-    """Sum of squared differences over the reference's sum of squares, where both pictures are finite.
+    """Sum of squared differences under the mask over the reference's sum of squares.
 
     Both are taken relative to the brightest value of the reference, so that no square overflows.
     """
     plain = image[..., None] if image.ndim == 2 else image
     wanted = (reference[..., None] if reference.ndim == 2 else reference).astype(plain.dtype)
-    counts = mask & jnp.all(jnp.isfinite(plain) & jnp.isfinite(wanted), axis=-1)
-    plain, wanted = (jnp.where(counts[..., None], a, 0) for a in (plain, wanted))
+    seen = mask & jnp.all(jnp.isfinite(plain), axis=-1)
+    plain, wanted = jnp.where(seen[..., None], plain, 0), jnp.where(mask[..., None], wanted, 0)
     top = jnp.max(jnp.abs(wanted))
     top = jnp.where(top > 0, top, 1)
     power = jnp.sum(jnp.square(wanted / top))
