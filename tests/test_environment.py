@@ -162,6 +162,10 @@ def test_bad_pixels_are_replaced_and_counted_once(radiance):
     ("call", "words"),
     [
         (lambda: se.sample_environment(np.ones((4, 8)), 4), r"radiance_map has shape \(4, 8\)"),
+        (
+            lambda: se.rotate_lights(se.Lights(np.eye(3), np.eye(3)), se.Camera(np.full((4, 4), np.nan), np.eye(4))),
+            "camera.view holds 16 NaN",
+        ),
         (lambda: se.sample_environment(np.ones((4, 8, 3)), 0), "count is 0; accepted are integers from 1"),
         (lambda: se.sample_environment(np.ones((4, 8, 3)), 2.5), "count is 2.5"),
         (lambda: se.sample_environment(np.zeros((4, 8, 3)), 4), "radiance_map holds no energy"),

@@ -322,6 +322,46 @@ def test_bad_pixels_stay_alone(dtype, rng):
         assert np.isfinite(gradient)
 
 
+@pytest.mark.parametrize(("bad", "instead"), [(np.nan, 0.0), (-np.inf, 0.0), (np.inf, None)])
+def test_bad_pixels_of_a_map_count_as_dark_or_as_the_brightest(bad, instead, dtype, rng):
+    gbuffer, _ = ball(dtype, rng)
+    clean = np.array(smooth_map(dtype))
+    spoilt = clean.copy()
+    spoilt[3, 4], spoilt[9, 20, 1] = bad, bad
+    clean[3, 4] = clean[9, 20, 1] = np.max(clean) if instead is None else instead
+    direction = np.asarray(gbuffer.normal)
+    reads = [
+        se.prefilter_map,
+        se.spherical_harmonics,
+        lambda m: se.environment_radiance(m, direction),
+        lambda m: se.shade_mirror(gbuffer, m),
+        lambda m: se.shade_diffuse(gbuffer, m),
+    ]
+    for read in reads:
+        np.testing.assert_array_equal(jax.jit(read)(spoilt), jax.jit(read)(clean))
+        gradient = jax.jit(jax.grad(lambda m, read=read: jnp.sum(read(m))))(jnp.asarray(spoilt))
+        assert np.all(np.isfinite(gradient))
+        assert np.all(gradient[3, 4] == 0)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_bad_pixels_of_a_picture_do_not_set_its_exposure(bad, dtype, rng):
+    picture = rng.uniform(0, 1, (6, 8, 3)).astype(dtype)
+    mask = np.indices((6, 8)).sum(axis=0) % 3 > 0
+    without = mask.copy()
+    without[2, 3] = False
+    spoilt = picture.copy()
+    spoilt[2, 3, 1] = bad
+    assert mask[2, 3]
+    assert se.auto_exposure(spoilt, mask) == se.auto_exposure(picture, without)
+    assert np.all(np.isfinite(jax.grad(se.auto_exposure)(jnp.asarray(spoilt), mask)))
+
+
+def test_the_tone_curve_of_negative_luminance_is_a_straight_line():
+    radiance = -np.linspace(0, 3, 13)[:, None] * np.ones(3, np.float32)
+    np.testing.assert_allclose(se.tone_map(radiance, exposure=0.5), 0.5 * radiance, rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
@@ -331,6 +371,13 @@ def test_bad_pixels_stay_alone(dtype, rng):
         (lambda g, m: se.shade_refraction(g, m, ior=0.5), "ior is 0.5"),
         (lambda g, m: se.shade_diffuse(g, m, invariant=1.0), "invariant is 1"),
         (lambda g, m: se.shade_phong(g, None), "lights is a NoneType"),
+        (lambda g, m: se.shade_phong(g, se.Lights(np.eye(3) * 1e30, np.eye(3))), "3 vector.* another length than 1"),
+        (lambda g, m: se.shade_mirror(g, m, alpha="40"), "alpha is '40'; accepted are real numbers"),
+        (lambda g, m: se.ashikhmin_shirley(g.normal, g.normal, g.normal, None), "material is a NoneType"),
+        (lambda g, m: se.tone_map(m, exposure=np.nan), "exposure is nan"),
+        (lambda g, m: se.tone_map(m, exposure=0.0), "exposure is 0"),
+        (lambda g, m: se.composite(m, m[..., 0], np.full(3, np.nan)), "background holds 3 NaN"),
+        (lambda g, m: se.contrast(m + 1j, m[..., 0] > 0), "image is an array of complex64; accepted are real"),
         (lambda g, m: se.lit_sphere(g, m, concave=m), "descriptor is a NoneType"),
         (lambda g, m: se.ambient_occlusion(g, None, radius=1.0), "camera is a NoneType"),
     ],

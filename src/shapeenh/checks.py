@@ -45,8 +45,19 @@ def check_shape(name: str, array, shape: tuple) -> None:
         raise ValueError(f"{name} {'is None' if array is None else f'has shape {given}'}; accepted is [{text}]")
 
 
+def check_real(name: str, array) -> None:
+    """Real numbers or booleans."""
+    if is_concrete(array) or hasattr(array, "dtype"):
+        dtype = array.dtype if hasattr(array, "dtype") else np.asarray(array).dtype
+        numbers = jnp.issubdtype(dtype, np.number) and not jnp.issubdtype(dtype, np.complexfloating)
+        if not numbers and not jnp.issubdtype(dtype, np.bool_):
+            given = repr(array) if np.ndim(array) == 0 else f"an array of {dtype}"
+            raise ValueError(f"{name} is {given}; accepted are real numbers")
+
+
 def check_finite(name: str, array) -> None:
-    """Every value finite (looked at where concrete)."""
+    """Every value a real number, and finite (looked at where concrete)."""
+    check_real(name, array)
     if is_concrete(array):
         bad = int(np.size(array) - np.count_nonzero(np.isfinite(np.asarray(array))))
         if bad:
@@ -57,9 +68,8 @@ def check_range(name: str, value, low: float, high: float, *, open_ends: bool = 
     """A finite scalar (or array) within [low, high], or ]low, high[ with `open_ends` (looked at where concrete)."""
     if not is_concrete(value):
         return
+    check_real(name, value)
     v = np.asarray(value)
-    if not (np.issubdtype(v.dtype, np.number) or v.dtype == bool) or np.issubdtype(v.dtype, np.complexfloating):
-        raise ValueError(f"{name} is {value!r}; accepted are real numbers")
     inside = (v > low) & (v < high) if open_ends else (v >= low) & (v <= high)
     if not np.all(inside & np.isfinite(v)):
         ends = f"]{low:g}, {high:g}[" if open_ends else f"[{low:g}, {high:g}]"

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shapeenh import checks, numerics
+from shapeenh.types import Lights, Material
 
 DIFFUSE = 28 / (23 * np.pi)
 
@@ -83,8 +84,26 @@ def facing_normal(normal, valid):
     return jnp.concatenate([normal[..., :2], jnp.abs(normal[..., 2:])], axis=-1)
 
 
+def check_lights(lights) -> None:
+    """A `Lights`; where concrete its values are finite and its directions unit vectors, to a tenth."""
+    checks.check_type("lights", lights, Lights)
+    checks.check_shape("lights.direction", lights.direction, (None, 3))
+    checks.check_shape("lights.radiance", lights.radiance, np.shape(lights.direction))
+    checks.check_finite("lights.direction", lights.direction)
+    checks.check_finite("lights.radiance", lights.radiance)
+    if checks.is_concrete(lights.direction):
+        lengths = np.linalg.norm(np.asarray(lights.direction, np.float64), axis=-1)
+        wrong = lengths[np.abs(lengths - 1) > 0.1]
+        if wrong.size:
+            raise ValueError(
+                f"lights.direction holds {wrong.size} vector(s) of another length than 1, such as {wrong[0]:.3g}; "
+                "accepted are unit vectors"
+            )
+
+
 def check_material(material) -> None:
-    """Ranges of the fields of `Material`, looked at where concrete."""
+    """A `Material`, and the ranges of its fields where concrete."""
+    checks.check_type("material", material, Material)
     checks.check_range("material.diffuse", material.diffuse, 0, 1)
     if material.specular is not None:
         checks.check_range("material.specular", material.specular, 0, 1)

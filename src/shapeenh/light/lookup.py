@@ -26,7 +26,8 @@ def environment_radiance(radiance_map, direction):
     """Radiance that arrives from a direction: bilinear in a latitude-longitude map.
 
     Source: SPEC 5 (eq. 1) and 7. radiance_map: [h, w, 3], linear RGB. direction: [..., 3], unit, the frame of the map.
-    Returns [..., 3]. Columns wrap around, rows end at the poles.
+    Returns [..., 3]. Columns wrap around, rows end at the poles. NaN in the map counts as 0, infinite values as the
+    largest finite one.
     Gradient: exact in the map, piecewise in the direction; 0 in the direction at the poles, where longitude is
     undefined.
     Errors: ValueError for other shapes.
@@ -34,7 +35,19 @@ def environment_radiance(radiance_map, direction):
     checks.check_shape("radiance_map", radiance_map, (None, None, 3))
     checks.check_shape("direction", direction, (..., 3))
     dtype = checks.float_dtype(radiance_map, direction)
-    texture, d = jnp.asarray(radiance_map, dtype), jnp.asarray(direction, dtype)
+    return looked_up(finite_map(jnp.asarray(radiance_map, dtype)), jnp.asarray(direction, dtype))
+
+
+def finite_map(radiance_map):
+    """The map with 0 for NaN and -inf, and its largest finite value for +inf; no gradient there."""
+    finite = jnp.isfinite(radiance_map)
+    top = jnp.max(lax.stop_gradient(radiance_map), initial=0, where=finite)
+    return jnp.where(finite, radiance_map, jnp.where(radiance_map == jnp.inf, top, 0))
+
+
+def looked_up(texture, d):
+    """`environment_radiance` of checked arrays, the map finite."""
+    dtype = d.dtype
     height, width = texture.shape[:2]
     x, y, z = d[..., 0], d[..., 1], d[..., 2]
     across = numerics.safe_hypot(x, z)
@@ -81,14 +94,15 @@ def spherical_harmonics(radiance_map):
     """Nine coefficients of a map's irradiance, Lbar(n) = integral L <n.l> dl / pi (Ramamoorthi and Hanrahan 2001).
 
     radiance_map: [h, w, 3]. Returns [9, 3], for `harmonic_radiance`. Within a few per cent of the convolution for maps
-    without small bright lamps; `prefilter_map` has no such limit.
+    without small bright lamps; `prefilter_map` has no such limit. NaN counts as 0, infinite values as the largest
+    finite one.
     Gradient: linear in the map. Errors: ValueError for another shape.
     """
     checks.check_shape("radiance_map", radiance_map, (None, None, 3))
     dtype = checks.float_dtype(radiance_map)
     direction, solid = _map_directions(*np.shape(radiance_map)[:2])
     basis = (_harmonics(direction, np) * solid[..., None] * _COSINE / np.pi).reshape(-1, 9)
-    weighted = jnp.asarray(basis, dtype)[:, :, None] * jnp.asarray(radiance_map, dtype).reshape(-1, 1, 3)
+    weighted = jnp.asarray(basis, dtype)[:, :, None] * finite_map(jnp.asarray(radiance_map, dtype)).reshape(-1, 1, 3)
     return jnp.sum(weighted, axis=0)
 
 
@@ -106,7 +120,8 @@ def prefilter_map(radiance_map, *, height=32):
     """The map convolved with the cosine: Lbar(n) = integral L <n.l> dl / pi, as a latitude-longitude map.
 
     Source: TH10 5.3.2, corrected (SPEC 15): cosine-weighted. radiance_map: [h, w, 3]. *Static*: height of the result.
-    Returns [height, 2 height, 3], for `environment_radiance`; a constant map stays itself.
+    Returns [height, 2 height, 3], for `environment_radiance`; a constant map stays itself. NaN counts as 0, infinite
+    values as the largest finite one.
     Gradient: linear in the map. Errors: ValueError for another shape or a height below 2.
     """
     checks.check_shape("radiance_map", radiance_map, (None, None, 3))
@@ -114,7 +129,7 @@ def prefilter_map(radiance_map, *, height=32):
     dtype = checks.float_dtype(radiance_map)
     source, solid = _map_directions(*np.shape(radiance_map)[:2])
     target, _ = _map_directions(height, 2 * height)
-    weighted = jnp.asarray(radiance_map, dtype) * jnp.asarray(solid, dtype)[..., None] / np.pi
+    weighted = finite_map(jnp.asarray(radiance_map, dtype)) * jnp.asarray(solid, dtype)[..., None] / np.pi
     source, target = (jnp.asarray(a, dtype) for a in (source.reshape(-1, 3), target))
     share = np.broadcast_to(solid / np.pi, np.shape(radiance_map)[:2]).reshape(-1, 1)
     table = jnp.concatenate([weighted.reshape(-1, 3), jnp.asarray(share, dtype)], axis=-1)

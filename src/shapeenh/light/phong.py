@@ -11,10 +11,10 @@ import numpy as np
 from jax import lax
 
 from shapeenh import checks, numerics
-from shapeenh.light.brdf import facing_normal
+from shapeenh.light.brdf import check_lights, facing_normal
 from shapeenh.light.scaling import check_strengths, radiance_scale, weighed_curvature
 from shapeenh.light.warp import unwarp, warp_tensor
-from shapeenh.types import Descriptor, GBuffer, Lights
+from shapeenh.types import Descriptor, GBuffer
 
 
 @functools.partial(jax.jit, static_argnames=("warped", "scaled"))
@@ -100,12 +100,10 @@ def shade_phong(
     Errors: ValueError for wrong records, shapes, values.
     """
     checks.check_type("gbuffer", gbuffer, GBuffer)
-    checks.check_type("lights", lights, Lights)
+    check_lights(lights)
     checks.check_shape("gbuffer.normal", gbuffer.normal, (None, None, 3))
     size = np.shape(gbuffer.normal)[:2]
     checks.check_shape("gbuffer.mask", gbuffer.mask, size)
-    checks.check_shape("lights.direction", lights.direction, (None, 3))
-    checks.check_shape("lights.radiance", lights.radiance, np.shape(lights.direction))
     checks.check_range("shininess", shininess, 0, np.inf)
     checks.check_range("exponent", exponent, 0, 1)
     strengths = {"gamma_ambient": gamma_ambient, "gamma_diffuse": gamma_diffuse, "gamma_specular": gamma_specular}

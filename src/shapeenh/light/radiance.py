@@ -13,7 +13,7 @@ from shapeenh.fusion import stored
 from shapeenh.light import brdf, sums, warp
 from shapeenh.light.scaling import check_strengths
 from shapeenh.light.weights import Model, by_lobe, gain
-from shapeenh.types import Descriptor, GBuffer, Lights, Material
+from shapeenh.types import Descriptor, GBuffer
 from shapeenh.wide import jit_wide
 
 # ------------------------------------------------------------------------------------------- what a pixel brings
@@ -133,11 +133,10 @@ def _shade_image(plan, mask, inputs, direction, radiance, count):
 def _shade(model: Model, gbuffer, lights, material, options: dict):
     """Common to all: checks, skips what the scene does not need, and calls the compiled sum."""
     checks.check_type("gbuffer", gbuffer, GBuffer)
-    checks.check_type("lights", lights, Lights)
-    checks.check_type("material", material, Material)
     checks.check_shape("gbuffer.normal", gbuffer.normal, (None, None, 3))
     size = np.shape(gbuffer.normal)[:2]
     checks.check_shape("gbuffer.mask", gbuffer.mask, size)
+    brdf.check_lights(lights)
     brdf.check_material(material)
 
     dtype = checks.float_dtype(gbuffer.normal)
@@ -191,10 +190,6 @@ def _steps() -> tuple[int, int]:
 
 def _prepared_lights(lights, dtype):
     """Directions and colours, padded to one of few sizes, and how many shine: other numbers compile nothing."""
-    checks.check_shape("lights.direction", lights.direction, (None, 3))
-    checks.check_shape("lights.radiance", lights.radiance, np.shape(lights.direction))
-    checks.check_finite("lights.direction", lights.direction)
-    checks.check_finite("lights.radiance", lights.radiance)
     direction, radiance = lights.direction, lights.radiance
     known = checks.is_concrete(lights)
     if known:

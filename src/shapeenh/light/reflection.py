@@ -15,7 +15,7 @@ from jax import lax
 
 from shapeenh import checks, numerics
 from shapeenh.light.brdf import ashikhmin_shirley, check_material, facing_normal
-from shapeenh.light.lookup import environment_radiance, harmonic_radiance
+from shapeenh.light.lookup import finite_map, harmonic_radiance, looked_up
 from shapeenh.light.scaling import check_strengths, radiance_scale, weighed_curvature
 from shapeenh.light.warp import warp, warp_tensor
 from shapeenh.types import Descriptor, GBuffer, Material
@@ -52,7 +52,8 @@ def _shade_lookup(look, warped, scaled, gbuffer, hessian, radiance_map, rotation
         bent = warp(direction, tensor)
         contrast = jnp.exp(options["contrast"] * jnp.log(numerics.determinant(tensor)))[..., None]
     harmonic = radiance_map.ndim == 2
-    find = harmonic_radiance if harmonic else environment_radiance
+    find = harmonic_radiance if harmonic else looked_up
+    radiance_map = finite_map(radiance_map)
     radiance = find(radiance_map, _to_map(bent, rotation))
     if scaled:
         # The level is the brightness relative to the map's brightest place, so that hue stays.
@@ -219,6 +220,7 @@ def shade_diffuse(
 
 @functools.partial(jax.jit, static_argnames=("samples",))
 def _integrate(samples, gbuffer, hessian, radiance_map, rotation, material, alpha, gamma):
+    radiance_map = finite_map(radiance_map)
     normal, valid = _shading_normal(gbuffer)
     valid = valid & jnp.all(jnp.isfinite(hessian), axis=-1)
     tensor = warp_tensor(jnp.where(valid[..., None], hessian, 0), alpha)
@@ -234,7 +236,7 @@ def _integrate(samples, gbuffer, hessian, radiance_map, rotation, material, alph
         bent = warp(l, tensor)
         cos, cos_bent = (jnp.sum(normal * d, axis=-1) for d in (l, bent))
         weight = jnp.where((cos > 0) & (cos_bent > 0), cos, 0)[..., None]
-        light = environment_radiance(radiance_map, _to_map(bent, rotation))
+        light = looked_up(radiance_map, _to_map(bent, rotation))
         return total + ashikhmin_shirley(normal, l, view, material) * light * weight, None
 
     directions = jnp.asarray(numerics.sphere_directions(samples), normal.dtype)

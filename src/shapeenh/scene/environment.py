@@ -288,12 +288,15 @@ def rotate_lights(lights: Lights, camera: Camera) -> Lights:
     """World directions to the camera's frame, the one of the normals.
 
     Source: DESIGN 2. lights: `Lights`, world. camera: `Camera`; the rotation of its `view` is used.
-    Returns `Lights` in camera space. Gradient: exact in both. Errors: ValueError for a wrong record or shape.
+    Returns `Lights` in camera space. Gradient: exact in both. Errors: ValueError for a wrong record or shape, for
+    values that are not finite.
     """
     checks.check_type("lights", lights, Lights)
     checks.check_type("camera", camera, Camera)
     checks.check_shape("camera.view", camera.view, (4, 4))
     checks.check_shape("lights.direction", lights.direction, (None, 3))
+    checks.check_finite("camera.view", camera.view)
+    checks.check_finite("lights.direction", lights.direction)
     dtype = checks.float_dtype(lights.direction)
     direction = _rotate(jnp.asarray(lights.direction, dtype), jnp.asarray(camera.view, dtype))
     return Lights(direction=direction, radiance=lights.radiance)
