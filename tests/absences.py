@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import shapeenh as se
+from shapeenh.scene.environment import map_directions
 from shapeenh.types import replace
 from tests.claims import H, W, lights, material
 from tests.scenes import Scene
@@ -199,6 +200,131 @@ absence(
     lambda s: jnp.full((H, W, 3), 0.35),
 )
 
+absence(
+    "sample_environment",
+    "negative pixels",
+    lambda s, x: se.sample_environment(s.map.at[2, 3].set(x), 5),
+    number([-1.0, -2.0, -3.0]),
+    number([3.0, 4.0, 9.0]),
+)
+absence(
+    "describe",
+    "silhouettes off their flanks",
+    lambda s, x: se.describe(_step(s, x)).silhouette,
+    number(0.0),
+    number(9.0),
+    slow=True,
+)
+for _name, _call in (
+    ("describe_object", lambda s, g: se.describe_object(g, s.curvature, s.camera).gradient),
+    ("describe_apparent", lambda s, g: se.describe_apparent(g).gradient),
+):
+    absence(
+        _name,
+        "held n_z",
+        lambda s, x, call=_call: call(
+            s, replace(s.gbuffer, normal=s.gbuffer.normal.at[..., 2].set(x * s.noise[..., 0]))
+        ),
+        number(0.005),
+        number(0.2),
+        slow=True,
+    )
+for _name, _call in (
+    ("line_field", lambda s, x: se.line_field("surface", s.gbuffer, replace(s.descriptor, gradient=x))),
+    ("make_line_field", lambda s, x: se.make_line_field(jnp.ones_like(x[..., 0]), x)),
+):
+    absence(
+        _name,
+        "no direction",
+        _call,
+        lambda s: jnp.zeros((H, W, 2)),
+        lambda s: s.field.direction + 0.1,
+        kind="finite",
+    )
+absence(
+    "fit_profile",
+    "not valid",  # far from every line the profile is 0, whatever the height does a little
+    lambda s, x: se.fit_profile(replace(s.field, height=x * jnp.ones((H, W))), samples=5).distance,
+    lambda s: jnp.ones((H, W)),
+    lambda s: s.field.height,
+)
+
+
+def _step(s, x):
+    """A plane whose right half lies farther back by x."""
+    right = jnp.arange(W) >= W // 2
+    depth = jnp.broadcast_to(3 + x * right, (H, W))
+    return se.GBuffer(
+        jnp.ones((H, W), bool),
+        depth,
+        jnp.broadcast_to(jnp.eye(3)[2], (H, W, 3)),
+        jnp.stack([*jnp.meshgrid(0.05 * jnp.arange(W), -0.05 * jnp.arange(H)), -depth], -1),
+    )
+
+
+# ------------------------------------------------------------------------------------------- between two texels
+# Look-ups that hit the middle of a texel, where four bilinear patches meet: the derivative is that of one of them.
+
+
+def _facing(s, normal):
+    return replace(s.gbuffer, normal=jnp.broadcast_to(normal, (H, W, 3)), mask=jnp.ones((H, W), bool))
+
+
+def _normal(z, *beside):
+    return number([*beside, z] / np.linalg.norm([*beside, z]))
+
+
+_MIDDLE = np.asarray(map_directions(height=8, width=16))[3, 1]  # its z is positive
+_UV, _ASIDE = number([0.3, 0.25]), number([0.13, 0.2])
+absence("sample_texture", "between texels", lambda s, x: se.sample_texture(s.texture, x), _UV, _ASIDE, kind="finite")
+for _name, _call in (
+    (
+        "apply_texture",
+        lambda s, uv: se.apply_texture(replace(s.gbuffer, uv=jnp.broadcast_to(uv, (H, W, 2))), s.texture),
+    ),
+    (
+        "apply_normal_map",
+        lambda s, uv: se.apply_normal_map(
+            s.gbuffer,
+            replace(s.mesh, uv=jnp.broadcast_to(uv, s.mesh.uv.shape)),
+            s.camera,
+            s.seen,
+            s.texture,
+            space="object",
+            check=False,
+        ),
+    ),
+):
+    absence(_name, "between texels", _call, _UV, _ASIDE, kind="finite")
+absence(
+    "environment_radiance",
+    "between texels",
+    lambda s, x: se.environment_radiance(s.map, x),
+    number(_MIDDLE),
+    number([0.3, -0.2, 0.0]),
+    kind="finite",
+)
+for _name, _at, _call in (
+    ("shade_mirror", _MIDDLE + [0.0, 0.0, 1.0], lambda s, g: se.shade_mirror(g, s.map)),
+    ("shade_diffuse", _MIDDLE, lambda s, g: se.shade_diffuse(g, s.map)),
+    ("shade_refraction", [0.0, 0.0, 1.0], lambda s, g: se.shade_refraction(g, s.map[:, :15], ior=1.4)),
+):
+    absence(
+        _name,
+        "between texels",
+        lambda s, x, call=_call: call(s, _facing(s, x)),
+        _normal(_at[2], *_at[:2]),
+        number([0.2, -0.2, 0.0]),
+        kind="finite",
+    )
+absence(
+    "lit_sphere",
+    "beyond the rim",
+    lambda s, x: se.lit_sphere(_facing(s, x), s.texture),
+    number([1.7, -1.6, 0.0]),
+    number([-1.3, 1.1, 0.0]),
+)
+
 # ------------------------------------------------------------------------------------------- degenerate geometry
 
 FLAT = number([[0.0, 0.0, 0.0], [1.0, 0.5, 0.0], [2.0, 1.0, 0.0]])
@@ -218,7 +344,6 @@ absence(
     lambda s, x: se.frame_mesh(moved(s, jnp.zeros_like(s.mesh.vertices).at[:4].set(_FRAME).at[0].set(x))).view,
     number([0.1, 0.05, 0.0]),
     number([4.0, 2.0, 0.0]),
-    kind="finite",
 )
 _FRAME = np.array([[0.1, 0.05, 0.0], [1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [0.0, 0.3, 0.2]])
 
@@ -274,6 +399,42 @@ absence(
     number([[0.0, 0.0, -1.0]]),
     number([[0.0, 0.0, 2.0]]),
 )
+# A light whose partner, from where the warp takes its radiance, sets: off, whatever the strength does a little.
+for _name, _options in (
+    ("shade_warped", {}),
+    ("shade_scaled", {"invariant": 0.5, "gamma_diffuse": 1.0, "gamma_specular": 1.0}),
+):
+    absence(
+        _name,
+        "partner sets",
+        lambda s, x, name=_name, options=_options: getattr(se, name)(
+            _facing(s, jnp.asarray([0.0, 0.0, 1.0])),
+            replace(s.descriptor, hessian=jnp.broadcast_to(jnp.asarray([-0.2, 0.0, -0.2]), (H, W, 3))),
+            se.Lights(jnp.asarray([[0.995, 0.0, 0.1]]), jnp.ones((1, 3))),
+            material({}),
+            alpha=x,
+            **options,
+        ),
+        number(40.0),
+        number(-39.9),
+        slow=True,
+    )
+absence(
+    "shade_forward",
+    "limb",
+    lambda s, x: se.shade_forward(
+        replace(s.gbuffer, normal=s.gbuffer.normal.at[..., 2].set(x)),
+        s.descriptor,
+        s.map,
+        material({}),
+        alpha=9.0,
+        samples=8,
+    ),
+    number(0.0),
+    number(0.3),
+    kind="finite",
+    slow=True,
+)
 absence(
     "shade_phong",
     "dark lobes",
@@ -288,6 +449,18 @@ absence(
     number(0.0),
     number(0.3),
     kind="finite",
+)
+
+absence(
+    "surface_noise",
+    "octaves",  # cells of exactly a power of two: an orthographic view of a plane, 1 world unit high
+    lambda s, x: se.surface_noise(
+        _step(s, 0.0), se.orthographic_camera((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), height=1.0, aspect=W / H), size=x
+    ),
+    number(H / 4),
+    number(-1.5),
+    kind="finite",
+    slow=True,
 )
 
 # ------------------------------------------------------------------------------------------- pictures and fits

@@ -622,6 +622,22 @@ for _samples in (1, 2):
     )
 SCALED = {"invariant": 0.3, "gamma_diffuse": 2.0, "gamma_specular": 1.5, "anisotropy": 0.4}
 claim(
+    "render",
+    lambda s, v: se.render(
+        s.mesh,
+        s.camera,
+        s.lights,
+        material(v),
+        se.RadianceScaling(**{k: v[k] for k in SCALED}),
+        height=H,
+        width=W,
+        sigma=v["sigma"],
+    ),
+    also(MATERIAL, sigma=40.0, **SCALED),
+    variant="scaled",
+    slow=True,
+)
+claim(
     "enhance",
     lambda s, v: se.enhance(
         gbuffer(s, v), lights(s, v), material(v), se.RadianceScaling(**{k: v[k] for k in SCALED}), sigma=v["sigma"]

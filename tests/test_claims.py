@@ -204,6 +204,34 @@ def test_the_fitted_parameter_moves_with_target_and_arguments(x64):
     np.testing.assert_allclose(got[1], (fitted(0.6, 0.5 + h) - fitted(0.6, 0.5 - h)) / (2 * h), rtol=1e-6)
 
 
+# ------------------------------------------------------------------------------------------- reverse mode only
+
+PAGE = (Path(__file__).parent.parent / "docs" / "gradients.md").read_text()
+
+
+def rows_of_the_page():
+    """{function: what its row says}"""
+    rows = re.findall(r"^\| (`[a-z_`, ]+`) \| (.*) \|$", PAGE, flags=re.MULTILINE)
+    return {name: text for names, text in rows for name in re.findall(r"`(\w+)`", names)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", dict.fromkeys(c.name for c in CLAIMS))
+def test_forward_mode_is_refused_where_the_page_says_so(name, x64):
+    scene, refused = scenes()["torus"], False
+    for claim in (c for c in CLAIMS if c.name == name):
+
+        def floats(v, claim=claim):
+            return [a for a in jax.tree.leaves(claim.call(scene, v)) if jnp.issubdtype(a.dtype, jnp.floating)]
+
+        values = {k: jnp.asarray(x) for k, x in claim.values(scene).items()}
+        try:
+            jax.jit(lambda v, floats=floats: jax.jvp(floats, (v,), (v,))).lower(values)
+        except TypeError:
+            refused = True
+    assert refused == ("reverse mode only" in rows_of_the_page()[name])
+
+
 # ------------------------------------------------------------------------------------------- completeness
 
 HERE = {"fit_contrast"}  # claimed by a test of its own above: it runs on the host
@@ -218,7 +246,4 @@ def test_every_public_name_claims_a_gradient_or_says_why_not():
 
 
 def test_the_page_on_gradients_names_the_same_functions():
-    page = (Path(__file__).parent.parent / "docs" / "gradients.md").read_text()
-    rows = re.findall(r"^\| (`[a-z_`, ]+`) \|", page, flags=re.MULTILINE)
-    named = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
-    assert named == {c.name for c in CLAIMS} | {a.name for a in ABSENCES} | HERE
+    assert set(rows_of_the_page()) == {c.name for c in CLAIMS} | {a.name for a in ABSENCES} | HERE
