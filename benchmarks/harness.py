@@ -7,6 +7,7 @@ at most, and results go to a folder of their own: a rough look, and a test that 
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
 import platform
@@ -23,6 +24,7 @@ import shapeenh as se
 
 QUICK = bool(os.environ.get("BENCHMARKS_QUICK"))
 RESULTS = Path(__file__).parent / "results" / ("quick" if QUICK else "")
+_first: list[dict[str, float]] = []  # the first calls of every `measure`, which compile: `write` keeps them
 
 
 def measure(calls: dict, *, repeats: int = 9, seconds: float = 20.0) -> dict[str, dict[str, float]]:
@@ -35,6 +37,7 @@ def measure(calls: dict, *, repeats: int = 9, seconds: float = 20.0) -> dict[str
         repeats, seconds = min(repeats, 3), min(seconds, 2.0)
     times: dict[str, list[float]] = {name: [] for name in calls}
     first = {name: _milliseconds(call) for name, call in calls.items()}
+    _first.append({str(name): round(ms, 3) for name, ms in first.items()})
     order, shuffle = list(calls), random.Random(0).shuffle
     start = time.perf_counter()
     for _ in range(repeats):
@@ -70,7 +73,7 @@ def machine() -> dict:
         "python": platform.python_version(),
         "jax": jax.__version__,
         "numpy": np.__version__,
-    }
+    } | {name: importlib.metadata.version(name) for name in ("scipy", "jaxopt", "optax", "trimesh")}
 
 
 def _processor() -> str:
@@ -97,10 +100,10 @@ def _text(value) -> str:
 
 
 def write(name: str, rows: list[dict], **more) -> Path:
-    """`results/NAME.json`: the machine, the rows, and whatever else there is to say."""
+    """`results/NAME.json`: the machine, the rows, what the first calls took, and whatever else there is to say."""
     RESULTS.mkdir(parents=True, exist_ok=True)
     path = RESULTS / f"{name}.json"
-    path.write_text(json.dumps({"machine": machine(), **more, "rows": rows}, indent=1) + "\n")
+    path.write_text(json.dumps({"machine": machine(), **more, "rows": rows, "first_ms": _first}, indent=1) + "\n")
     return path
 
 

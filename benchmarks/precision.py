@@ -6,7 +6,7 @@ that snaps to another 1/256 px shows another face at a handful of pixels; these,
 left out. Errors are relative to the size of the value: a vector's length, a tensor's norm, but never less than 1e-3 of
 the image's own rms, so that zeros do not count as infinitely wrong. Half an ulp of float32 is 6e-8. Last, the lights'
 colours rounded to bfloat16, and the normals and Hessians that light reads; and the time of the whole chain in each.
-Without meshes: bunny.obj and armadillo.obj of the folder SHAPEENH_DATA where there is one, and the embedded knot.
+Without meshes: bunny, armadillo and fandisk of the folder SHAPEENH_DATA where there is one, and the embedded knot.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ LIMITS = {
     "gradient": "the normals: at outlines g = -n_xy/n_z amplifies their error by 1/n_z, up to a hundred times",
     "hessian": "the slopes: their differences cancel where the surface is flat",
     "warp tensor": "the Hessian; the tensor itself is bounded and does not cancel",
+    "radiance, scaled": "as radiance; curvature moves the gain, which is bounded",
+    "ridge height": "the Hessian, smoothed once more; where the height nears 0 its own size does",
     "radiance": "the warp tensor and the normals; a Phong exponent of 300 multiplies the rounding of n.h",
 }
 
@@ -66,6 +68,13 @@ class Chain:
     def picture(self):
         gbuffer = self.gbuffer()
         return self.shade(gbuffer, self.describe(gbuffer))
+
+    def scale(self, gbuffer, descriptor):
+        strengths = {"invariant": 0.3, "gamma_diffuse": 8.0, "gamma_specular": 8.0}
+        return se.shade_scaled(gbuffer, descriptor, self.lights, se.named_material("porcelain"), **strengths)
+
+    def heights(self, gbuffer, descriptor):
+        return se.line_field("ridge", gbuffer, descriptor).height[..., None]
 
     def shade(self, gbuffer, descriptor):
         material = se.named_material("porcelain")
@@ -113,10 +122,11 @@ def budget(mesh, environment, *, width: int, height: int, count: int) -> tuple[l
         also = np.asarray(se.rasterize(double.mesh, double.camera, **size).triangle)
         form = double.describe(fine)
         warp, image = double.tensor(form), double.shade(fine, form)
+        scaled, ridges = double.scale(fine, form), double.heights(fine, form)
         fine32, form32 = cast(fine, jnp.float32), cast(form, jnp.float32)
         fine32, form32 = jax.tree.map(np.asarray, (fine32, form32))
-        truth = jax.tree.map(np.asarray, (fine, form, warp, image))
-    fine, form, warp, image = truth
+        truth = jax.tree.map(np.asarray, (fine, form, warp, image, scaled, ridges))
+    fine, form, warp, image, scaled, ridges = truth
     mask = np.asarray(rough.mask) & ~around(seen != also, int(np.ceil(4 * SIGMA * height / 600)) + 3)
 
     own = single.describe(jax.tree.map(jnp.asarray, fine32))
@@ -135,6 +145,12 @@ def budget(mesh, environment, *, width: int, height: int, count: int) -> tuple[l
             image,
         ),
     }
+    exact = jax.tree.map(jnp.asarray, fine32), exact_shape
+    for stage, function, wanted in (
+        ("radiance, scaled", single.scale, scaled),
+        ("ridge height", single.heights, ridges),
+    ):
+        pairs[stage] = function(*exact), function(rough, rough_form), wanted
     rows = []
     for stage, (alone, after, wanted) in pairs.items():
         for kind, got in (("own", alone), ("cumulative", after)):
@@ -164,7 +180,7 @@ def main() -> None:
     parser.add_argument("--lights", type=int, default=54)
     arguments = parser.parse_args()
     width, height = (int(n) for n in arguments.size.split("x"))
-    meshes = harness.meshes(arguments.meshes, knot=True)
+    meshes = harness.meshes(arguments.meshes, ("bunny", "armadillo", "fandisk"), knot=True)
     rows, facts, times = [], {}, []
     for name, mesh in meshes.items():
         made, facts[name], calls = budget(

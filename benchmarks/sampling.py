@@ -64,19 +64,25 @@ def main() -> None:
         of = [r for r in rows if r["method"] == method]
         means[method] = {n: round(float(np.exp(np.mean([np.log(r[f"N={n}"]) for r in of]))), 4) for n in COUNTS}
     print("geometric mean over all:", means)
-    said = conclude(means)
-    print(harness.write("sampling", rows, reference=REFERENCE, mean=means, answer=said))
+    times = milliseconds()
+    said = conclude(means, times)
+    print(harness.write("sampling", rows, reference=REFERENCE, mean=means, milliseconds=times, answer=said))
     print(said)
 
 
-def conclude(means) -> str:
-    """The plot, and the sentence."""
+def milliseconds() -> dict:
+    """By method and number of lights, the median of warped shading of a large ball."""
     scene, material = sums.ball(sums.COVERED), sums.material()
     ms = {}
     for method in METHODS:
         lights = {n: se.sample_environment(se.procedural_studio(), n, method=method) for n in COUNTS}
         shade = {n: lambda l=l: se.shade_warped(*scene, l, material, alpha=30.0) for n, l in lights.items()}
         ms[method] = {n: times["median_ms"] for n, times in harness.measure(shade, repeats=5).items()}
+    return ms
+
+
+def conclude(means, ms) -> str:
+    """The plot, and the sentence."""
     series = {m: [(str(n), ms[m][n], means[m][n]) for n in COUNTS] for m in METHODS}
     harness.pareto("sampling", series, default="median_cut 54", title="Lights", error="relative rms error")
     default, fewer = means["median_cut"][54], means["median_cut"][16]

@@ -90,8 +90,8 @@ def main() -> None:
     repeats = parser.parse_args().repeats
     rows = []
     for name, (general, skipping) in pairs().items():
-        pictures = [np.asarray(call(), np.float64) for call in (general, skipping)]
         times = harness.measure({"general": general, "skipping": skipping}, repeats=repeats)
+        pictures = [np.asarray(call(), np.float64) for call in (general, skipping)]
         slow, fast = times["general"]["median_ms"], times["skipping"]["median_ms"]
         same = name not in OTHER_PICTURES
         difference = float(np.abs(pictures[1] - pictures[0]).max() / np.abs(pictures[0]).max()) if same else None

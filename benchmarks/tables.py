@@ -52,15 +52,21 @@ def precision(found: dict) -> str:
     """A row per stage, the worst of all meshes."""
     measures = ("median", "99 %", "max")
     head = ["stage", *(f"{kind}: {m}" if m == "median" else m for kind in ("own", "cumulative") for m in measures)]
+    head += ["pixels > 1 %"]
     worst: dict[tuple, float] = {}
     for r in found["rows"]:
-        for m in measures:
+        for m in (*measures, "pixels > 1e-2"):
             key = r["stage"], r["error"], m
             worst[key] = max(worst.get(key, 0.0), r[m])
     number = lambda x: f"{x:.1e}".replace("e-0", "e-")  # noqa: E731
     stages = dict.fromkeys(r["stage"] for r in found["rows"])
     return markdown(
-        head, [[s, *(number(worst[s, kind, m]) for kind in ("own", "cumulative") for m in measures)] for s in stages]
+        head,
+        [
+            [s, *(number(worst[s, kind, m]) for kind in ("own", "cumulative") for m in measures)]
+            + [f"{worst[s, 'cumulative', 'pixels > 1e-2']:.0f}"]
+            for s in stages
+        ],
     )
 
 
