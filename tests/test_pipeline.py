@@ -40,6 +40,18 @@ def test_the_picture_has_light_where_the_mask_is_and_nowhere_else(dtype):
     assert np.all(np.asarray(image)[mask].max(axis=-1) > 0)
 
 
+@pytest.mark.parametrize("samples", [1, 2])
+def test_repeated_pictures_have_the_same_bytes(samples):
+    """As large as makes several cores share the work."""
+    mesh, camera, lights, material = scene()
+    size = {"height": 4 * H, "width": 4 * W}
+    seen = [np.asarray(se.rasterize(mesh, camera, **size).triangle).tobytes() for _ in range(3)]
+    assert seen[0] == seen[1] == seen[2]
+    picture = lambda: se.render(mesh, camera, lights, material, se.LightWarp(30.0), sigma=1.0, samples=samples, **size)  # noqa: E731
+    first, *others = (np.asarray(picture()).tobytes() for _ in range(3))
+    assert all(first == other for other in others)
+
+
 @functools.cache
 def compiled():
     """jit of (enhancement, sigma) -> picture of the scene in float64."""

@@ -374,6 +374,14 @@ def test_bad_pixels_stay_alone(function, kind, bad):
         assert np.array_equal(np.asarray(a)[keep], np.asarray(b)[keep])
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("function", "kind"), STAGES.values())
+def test_repeated_runs_give_the_same_bytes(function, kind):
+    i, p = hostile.images(TAME, SHAPE, np.float32), parameters(TAME, np.float32)
+    first, *others = ([np.asarray(a).tobytes() for a in jax.tree.leaves(run(function, i, p))] for _ in range(3))
+    assert all(first == other for other in others)
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize(("function", "kind"), STAGES.values())
 def test_tiny_images(function, kind):
