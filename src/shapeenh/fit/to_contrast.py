@@ -9,7 +9,6 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import direct
 
 from shapeenh import checks
 from shapeenh.fit import solve
@@ -186,6 +185,8 @@ def _explore(search, sign):
 
     Climbs see the hills that the survey hit; this one finds those between. Most of what is left of the budget.
     """
+    from scipy.optimize import direct
+
     limit = len(search.points) + int(0.7 * (search.budget - len(search.points)))
 
     def on_host(place):
