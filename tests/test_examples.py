@@ -12,7 +12,10 @@ EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
 
 @pytest.mark.parametrize(
     "example",
-    [pytest.param(e, marks=pytest.mark.slow if "fit" in e.stem else pytest.mark.thorough, id=e.stem) for e in EXAMPLES],
+    [
+        pytest.param(e, marks=pytest.mark.slow if e.stem == "fit_environments" else pytest.mark.thorough, id=e.stem)
+        for e in EXAMPLES
+    ],
 )
 def test_every_example_runs(example, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -293,12 +293,17 @@ def program(function, gradient: bool):
     return Counted(lambda *args: value(*args)[1])
 
 
-def run(function, i, p, gradient=True):
+def run(function, i, p, gradient=True, made=program):
     floats = {name: image for name, image in i.items() if name != "mask"}
-    return program(function, gradient)(floats, i["mask"], p)
+    return made(function, gradient)(floats, i["mask"], p)
 
 
-exactly = functools.cache(program.__wrapped__)  # programs of float64, apart from those whose number is counted
+# Programs of float64 and of other shapes, apart from those whose number is counted.
+uncounted = functools.cache(program.__wrapped__)
+
+
+def as_numpy(tree):
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
 
 
 def not_finite(gradients):
@@ -317,7 +322,7 @@ def overflows(function, i, p):
 
     floats = {name: wide(image) for name, image in i.items() if name != "mask"}
     with jax.enable_x64(True):
-        _, gradients = exactly(function, True)(floats, i["mask"], jax.tree.map(wide, p))
+        _, gradients = uncounted(function, True)(floats, i["mask"], jax.tree.map(wide, p))
     return max(np.max(np.abs(leaf), initial=0) for leaf in jax.tree.leaves(gradients)) > 1e-3 * np.finfo(np.float32).max
 
 
@@ -345,9 +350,11 @@ STEEP = hostile.Draw(
 @settings
 @hypothesis.example(draw=STEEP)
 @hypothesis.given(draw=hostile.draws)
-def test_pictures_and_gradients_of_hostile_inputs_are_finite(function, kind, draw):
+def test_pictures_and_gradients_of_hostile_inputs_are_finite_and_repeat(function, kind, draw):
     i, p = hostile.images(draw, SHAPE, np.float32), parameters(draw, np.float32)
-    (_, out), gradients = run(function, i, p)
+    (_, out), gradients = first = run(function, i, p)
+    again = run(function, i, p)
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(*map(as_numpy, (first, again)), strict=True))
     check_outputs(out, SHAPE, np.float32)
     assert program(function, True).traces == 1
     bad = not_finite(gradients)
@@ -374,23 +381,16 @@ def test_bad_pixels_stay_alone(function, kind, bad):
         assert np.array_equal(np.asarray(a)[keep], np.asarray(b)[keep])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("function", "kind"), STAGES.values())
-def test_repeated_runs_give_the_same_bytes(function, kind):
-    i, p = hostile.images(TAME, SHAPE, np.float32), parameters(TAME, np.float32)
-    first, *others = ([np.asarray(a).tobytes() for a in jax.tree.leaves(run(function, i, p))] for _ in range(3))
-    assert all(first == other for other in others)
-
-
 @pytest.mark.thorough
+@pytest.mark.parametrize("shape", TINY)
 @pytest.mark.parametrize(("function", "kind"), STAGES.values())
-def test_tiny_images(function, kind):
-    """One shape per stage, in turn, since each compiles anew; the tests of the modules have the others."""
-    shape = TINY[list(STAGES).index(function.__name__) % len(TINY)]
-    for seed in range(4):
-        draw = dataclasses.replace(TAME, seed=seed, mask=("full", "empty", "one pixel", "checkerboard")[seed])
+def test_tiny_images_and_their_gradients(function, kind, shape):
+    for seed, mask in enumerate(("full", "empty", "one pixel", "checkerboard")):
+        draw = dataclasses.replace(TAME, seed=seed, mask=mask)
         i, p = hostile.images(draw, shape, np.float32), parameters(draw, np.float32)
-        check_outputs(run(function, i, p, gradient=False), shape, np.float32)
+        (_, out), gradients = run(function, i, p, made=uncounted)
+        check_outputs(out, shape, np.float32)
+        assert not not_finite(gradients)
 
 
 @pytest.mark.thorough
