@@ -9,6 +9,7 @@ meshes and maps of the folder SHAPEENH_DATA where there is one, and the embedded
 from __future__ import annotations
 
 import argparse
+import importlib.metadata
 import time
 import warnings
 
@@ -241,7 +242,8 @@ def main() -> None:
     ]
     print(harness.table(rows), "", harness.table(pictures), sep="\n")
     said = conclude(rows)
-    facts = {"size": arguments.size, "scenes": [s.name for s in prepared], "answer": said}
+    solvers = {name: importlib.metadata.version(name) for name in ("scipy", "jaxopt", "optax")}
+    facts = {"size": arguments.size, "solvers": solvers, "scenes": [s.name for s in prepared], "answer": said}
     print(harness.write("fit", rows, pictures=pictures, missed=missed, **facts))
     print(said)
 

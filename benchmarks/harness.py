@@ -7,7 +7,6 @@ at most, and results go to a folder of their own: a rough look, and a test that 
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import os
 import platform
@@ -73,7 +72,7 @@ def machine() -> dict:
         "python": platform.python_version(),
         "jax": jax.__version__,
         "numpy": np.__version__,
-    } | {name: importlib.metadata.version(name) for name in ("scipy", "jaxopt", "optax", "trimesh")}
+    }
 
 
 def _processor() -> str:
