@@ -139,14 +139,10 @@ def budget(mesh, environment, *, width: int, height: int, count: int) -> tuple[l
         "gradient": (own.gradient, rough_form.gradient, form.gradient),
         "hessian": (own.hessian, rough_form.hessian, form.hessian),
         "warp tensor": (single.tensor(exact_shape), single.tensor(rough_form), warp),
-        "radiance": (
-            single.shade(jax.tree.map(jnp.asarray, fine32), exact_shape),
-            single.shade(rough, rough_form),
-            image,
-        ),
     }
     exact = jax.tree.map(jnp.asarray, fine32), exact_shape
     for stage, function, wanted in (
+        ("radiance", single.shade, image),
         ("radiance, scaled", single.scale, scaled),
         ("ridge height", single.heights, ridges),
     ):

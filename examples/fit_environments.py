@@ -46,16 +46,14 @@ def fitted(names, lights):
     )
 
 
-names = ("alpha",)
-try:
-    fit = fitted(names, other)
-except ValueError as out_of_reach:  # it says between which contrasts alpha can choose
-    print(f"alpha alone does not reach it: {out_of_reach}")
-    names = ("alpha", "gamma")
+for names in (("alpha",), ("alpha", "gamma")):
     try:
         fit = fitted(names, other)
-    except ValueError as error:
-        parser.exit(1, f"nor does gamma with it: {error}\n")
+        break
+    except ValueError as out_of_reach:  # it says which contrasts can be reached
+        print(f"{' and '.join(names)} alone: {out_of_reach}")
+else:
+    parser.exit(1)
 print(f"alpha {fit.parameters.alpha:.2f}, gamma {fit.parameters.gamma:.3f} give it, after {fit.renders} pictures")
 
 

@@ -15,7 +15,7 @@ import shapeenh as se
 from shapeenh.scene.environment import map_directions
 from shapeenh.types import replace
 from tests.claims import H, W, lights, material
-from tests.scenes import Scene
+from tests.scenes import Scene, unit
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ absence(
 absence(
     "describe",
     "silhouettes off their flanks",
-    lambda s, x: se.describe(_step(s, x)).silhouette,
+    lambda s, x: se.describe(_step(x)).silhouette,
     number(0.0),
     number(9.0),
     slow=True,
@@ -250,7 +250,7 @@ absence(
 )
 
 
-def _step(s, x):
+def _step(x):
     """A plane whose right half lies farther back by x."""
     right = jnp.arange(W) >= W // 2
     depth = jnp.broadcast_to(3 + x * right, (H, W))
@@ -268,10 +268,6 @@ def _step(s, x):
 
 def _facing(s, normal):
     return replace(s.gbuffer, normal=jnp.broadcast_to(normal, (H, W, 3)), mask=jnp.ones((H, W), bool))
-
-
-def _normal(z, *beside):
-    return number([*beside, z] / np.linalg.norm([*beside, z]))
 
 
 _MIDDLE = np.asarray(map_directions(height=8, width=16))[3, 1]  # its z is positive
@@ -313,7 +309,7 @@ for _name, _at, _call in (
         _name,
         "between texels",
         lambda s, x, call=_call: call(s, _facing(s, x)),
-        _normal(_at[2], *_at[:2]),
+        number(unit(np.asarray(_at))),
         number([0.2, -0.2, 0.0]),
         kind="finite",
     )
@@ -455,7 +451,7 @@ absence(
     "surface_noise",
     "octaves",  # cells of exactly a power of two: an orthographic view of a plane, 1 world unit high
     lambda s, x: se.surface_noise(
-        _step(s, 0.0), se.orthographic_camera((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), height=1.0, aspect=W / H), size=x
+        _step(0.0), se.orthographic_camera((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), height=1.0, aspect=W / H), size=x
     ),
     number(H / 4),
     number(-1.5),
